@@ -148,7 +148,7 @@ def main() -> int:
         missing = {path.name for path in SOURCE.glob("*.c")} - {f.name for f in files}
         complaints = [f"{name}: not among the written sources." for name in sorted(missing)]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            complaints += [c for found in pool.map(compile_strictly, work) for c in found]
+            complaints += [c for result in pool.map(compile_strictly, work) for c in result]
     for item in work:
         print(item.name, "-", " ".join(path.name for path in item.sources))
     print("\n".join(complaints) or f"{len(files)} C files compile without a warning.")

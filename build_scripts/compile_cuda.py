@@ -46,8 +46,8 @@ def models() -> Iterator[tuple[str, Model]]:
 
 def tools() -> tuple[ctypes.CDLL, Path]:
     """Return NVRTC and the path of ptxas, from their wheels."""
-    found = importlib.util.find_spec("nvidia")
-    for folder in found.submodule_search_locations or () if found else ():
+    result = importlib.util.find_spec("nvidia")
+    for folder in result.submodule_search_locations or () if result else ():
         libraries = sorted(Path(folder).glob("cuda_nvrtc/lib/libnvrtc*.so.1?*"))
         assembler = Path(folder, "cuda_nvcc/bin/ptxas")
         if libraries and assembler.exists():
@@ -72,10 +72,10 @@ def compiled(nvrtc: ctypes.CDLL, text: str, capability: str) -> str:
     buffer = ctypes.create_string_buffer(size.value)
     getattr(nvrtc, f"nvrtcGet{wanted}")(program, buffer)
     nvrtc.nvrtcDestroyProgram(ctypes.byref(program))
-    found = buffer.value.decode()
+    result = buffer.value.decode()
     if status:
-        raise SystemExit(found)
-    return found
+        raise SystemExit(result)
+    return result
 
 
 def taken(ptxas: Path, ptx: str, capability: str) -> str:
@@ -84,24 +84,24 @@ def taken(ptxas: Path, ptx: str, capability: str) -> str:
         Path(scratch, "kernel.ptx").write_text(ptx, encoding="utf-8")
         command = [str(ptxas), "-v", f"-arch=sm_{capability}", "kernel.ptx", "-o", "kernel.cubin"]
         done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, check=False)
-    said = _SAID.search(done.stderr)
-    if done.returncode or said is None:
+    statement = _SAID.search(done.stderr)
+    if done.returncode or statement is None:
         raise SystemExit(done.stdout + done.stderr)
-    stack, stores, loads, registers = said.groups()
+    stack, stores, loads, registers = statement.groups()
     return f"{registers} registers, {stack} bytes a thread, spills {stores} and {loads} bytes"
 
 
 def main() -> int:
     """Compile all kernels for the capabilities that are named; print a line of each."""
     nvrtc, ptxas = tools()
-    seen: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for name, model in models():
         output = next(q for q in SHOWN if q in model.output_names)
         text = kernel_text(model.structure, output)
-        if text in seen:
-            print(f"{name}: the kernel of {seen[text]}")
+        if text in texts:
+            print(f"{name}: the kernel of {texts[text]}")
             continue
-        seen[text] = name
+        texts[text] = name
         for capability in sys.argv[1:] or CAPABILITIES:
             line = taken(ptxas, compiled(nvrtc, text, capability), capability)
             print(f"{name}, sm_{capability}: {line}", flush=True)

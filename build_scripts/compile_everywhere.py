@@ -28,10 +28,10 @@ def main() -> int:
     """Compile all; return 1 if one of them failed."""
     cases = [(name, exported_texts(model, "psa")[1]) for name, model in models()]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = [pool.submit(complaint, *c, p) for c in cases for p in PLATFORMS.values()]
-        complaints = [said for said in (f.result() for f in found) if said]
+        items = [pool.submit(complaint, *c, p) for c in cases for p in PLATFORMS.values()]
+        complaints = [statement for statement in (f.result() for f in items) if statement]
     print("\n".join(complaints))
-    print(f"ziglang {version('ziglang')}: {len(found) - len(complaints)} of {len(found)} binaries.")
+    print(f"ziglang {version('ziglang')}: {len(items) - len(complaints)} of {len(items)} binaries.")
     return 1 if complaints else 0
 
 

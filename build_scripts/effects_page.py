@@ -61,11 +61,11 @@ def overview() -> Table:
 def picture(name: str) -> tuple[bytes, str]:
     """Return the picture of an effect's signature as PNG, and on what it is simulated."""
     effect = EFFECTS[name]
-    seen = signature(effect)
+    observed = signature(effect)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "signature.png"
-        save_signature(effect, seen, path)
-        return path.read_bytes(), size_sentence(seen)
+        save_signature(effect, observed, path)
+        return path.read_bytes(), size_sentence(observed)
 
 
 def section(effect: Component) -> str:
@@ -84,8 +84,8 @@ def section(effect: Component) -> str:
     ]
     if effect.name in EFFECTS:
         path, words = f"{PICTURES}/{effect.name}.png", picture(effect.name)[1]
-        shown = f"![Signature of {effect.name}. {words}]({path}){{ loading=lazy }}"
-        parts.insert(4, f"[{shown}]({path})")
+        text = f"![Signature of {effect.name}. {words}]({path}){{ loading=lazy }}"
+        parts.insert(4, f"[{text}]({path})")
         parts.insert(5, f"[Switch it on and change it]({PLAYGROUND}#{effect.name})")
     return "\n\n".join(parts)
 

@@ -86,8 +86,8 @@ def find_blocks(text: str, page: str = "README.md") -> tuple[Block, ...]:
                 content.append(inner)
             else:
                 raise ValueError(f"line {number}: this block has no end; close it with ```.")
-            if found := commands_of(fence["language"], content):
-                blocks.append(Block(number, (*before, *found), frozenset(marks), page))
+            if result := commands_of(fence["language"], content):
+                blocks.append(Block(number, (*before, *result), frozenset(marks), page))
             marks, before = set(), []
         elif line.strip():
             marks, before = set(), []
@@ -145,9 +145,9 @@ def run_block(block: Block, directory: Path) -> str | None:
     return None
 
 
-def _tell(command: str, said: bytes | None, end: str) -> None:
+def _tell(command: str, data: bytes | None, end: str) -> None:
     """Print a command and what it said at once, so that two do not mix."""
-    text = (said or b"").decode("utf-8", "replace")
+    text = (data or b"").decode("utf-8", "replace")
     print(f"$ {command.partition(chr(10))[0]}\n{text}  [{end}]\n", end="", flush=True)
 
 

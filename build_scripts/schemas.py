@@ -47,8 +47,8 @@ def json_schema(record: type) -> dict[str, Any]:
             if rules.get("type") == "object" and name not in schema.get("required", ()):
                 rules.setdefault("default", {})  # msgspec says it from 0.23 on
     root = defined.pop(record.__name__)
-    found = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root}
-    return {**found, "$defs": dict(sorted(defined.items()))} if defined else found
+    table = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root}
+    return {**table, "$defs": dict(sorted(defined.items()))} if defined else table
 
 
 def main() -> None:

@@ -78,11 +78,11 @@ def described(page: str) -> str:
     """Return a page whose pictures are described by the heading above them."""
     heading = ""
 
-    def words(found: re.Match[str]) -> str:
+    def words(match: re.Match[str]) -> str:
         nonlocal heading
-        if found["heading"] is None:
+        if match["heading"] is None:
             return f"![Figure: {heading}]("
-        heading = found["heading"]
-        return found[0]
+        heading = match["heading"]
+        return match[0]
 
     return _HEADING_OR_PICTURE.sub(words, page)

@@ -204,10 +204,10 @@ _TEXTS = {
 }
 
 
-def _show(what: str, *given: Any, **options: Any) -> Any:
+def _show(what: str, *inputs: Any, **options: Any) -> Any:
     """Make what a result shows of itself."""
     module = import_module(_TEXTS.get(what, "psa_casadi.report.shown"))
-    return getattr(module, what)(*given, **options)
+    return getattr(module, what)(*inputs, **options)
 
 
 psa_casadi.shown.register(_show)

@@ -118,10 +118,10 @@ def _refuse(room: Path, error: OSError) -> None:
 def _found_or_made(
     room: Path, name: str, make: Callable[[Path], Path], usable: Callable[[Path], object]
 ) -> Path:
-    path, beside = room / name, room / f"{name}.sha256"
+    path, others = room / name, room / f"{name}.sha256"
     _make_ours(room)
     try:
-        whole = _read(beside) == _checksum(name, _read(path))
+        whole = _read(others) == _checksum(name, _read(path))
     except OSError:
         whole = False
     if not whole:
@@ -129,9 +129,9 @@ def _found_or_made(
             raise OSError(errno.EACCES, "not written to any more", str(room))
         with temporary_folder(room) as work:
             made = make(work)
-            checksum = made.with_name(beside.name)
+            checksum = made.with_name(others.name)
             checksum.write_bytes(_checksum(name, made.read_bytes()))
-            for source, target in ((checksum, beside), (made, path)):
+            for source, target in ((checksum, others), (made, path)):
                 if target.is_dir() and not target.is_symlink():
                     shutil.rmtree(target)
                 source.chmod(0o700)

@@ -111,13 +111,15 @@ def heard(child: Child, *, limit: float | None = None) -> subprocess.CompletedPr
     try:
         while True:
             try:
-                said, complained = child.communicate(timeout=_LOOK)
+                statement, complained = child.communicate(timeout=_LOOK)
             except subprocess.TimeoutExpired:
                 raise_if_stopped()
                 if end is not None and time.monotonic() > end:
                     raise
             else:
-                return subprocess.CompletedProcess(child.args, child.returncode, said, complained)
+                return subprocess.CompletedProcess(
+                    child.args, child.returncode, statement, complained
+                )
     finally:
         kill(child)
         close_pipes(child)

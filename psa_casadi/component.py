@@ -313,7 +313,7 @@ class KeptEquations:
         return Equations(**parts)
 
 
-def _found(module: str, name: str, given: str | None, key: Any) -> Any:
+def _found(module: str, name: str, text: str | None, key: Any) -> Any:
     """Return a component of a table, or of what a function makes of what is given."""
     table = getattr(import_module(module), name)
-    return (table if given is None else table(given))[key]
+    return (table if text is None else table(text))[key]

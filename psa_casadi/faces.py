@@ -25,11 +25,11 @@ from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
 
 
-def _told_of(own: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def _told_of(item: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add to a function's help what it is for a model of one's own."""
 
     def told(face: Callable[..., Any]) -> Callable[..., Any]:
-        words = f"Of a model of your own, {face.__name__}{signature(own)}:\n\n    {own.__doc__}"
+        words = f"Of a model of your own, {face.__name__}{signature(item)}:\n\n    {item.__doc__}"
         face.__doc__ = f"{face.__doc__}\n    {words}"
         return face
 
@@ -60,9 +60,9 @@ def identify(
 @on_a_terminal
 @_told_of(identify_ode)
 @wraps(stack.identify)
-def identify(*given: Any, **words: Any) -> Any:
+def identify(*inputs: Any, **words: Any) -> Any:
     """Identify a stack from its records, or a model of one's own, given first, from its."""
-    model, records = _models_first(given, words)
+    model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return stack.identify(records, model=model, **_known(words, stack.identify))
     return _own(identify_ode, model, records, words)
@@ -99,9 +99,9 @@ def diagnose(
 @on_a_terminal
 @_told_of(diagnose_ode)
 @wraps(diagnosis.diagnose)
-def diagnose(*given: Any, **words: Any) -> Any:
+def diagnose(*inputs: Any, **words: Any) -> Any:
     """Diagnose a stack's records, or a model of one's own, given first, on its records."""
-    model, records = _models_first(given, words)
+    model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return diagnosis.diagnose(records, model=model, **_known(words, diagnosis.diagnose))
     return _own(diagnose_ode, model, records, words)
@@ -115,17 +115,17 @@ def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, 
 
 def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
     """Return the words for a piece of work. Raises InputError for one that it does not take."""
-    own = [n for n in signature(work).parameters if n not in ("model", "records")]
+    items = [n for n in signature(work).parameters if n not in ("model", "records")]
     for word in words:
-        if word not in own:
-            what = "a model of your own" if "known_start" in own else "a stack"
-            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(own)}.")
+        if word not in items:
+            what = "a model of your own" if "known_start" in items else "a stack"
+            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(items)}.")
     return words
 
 
-def _models_first(given: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:
+def _models_first(inputs: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:
     """Return the model, if there is one, and the records; `words` lose both."""
-    left = list(given)
+    left = list(inputs)
     model = left.pop(0) if left and isinstance(left[0], Model) else words.pop("model", None)
     if left[1:] and isinstance(left[1], Model):
         raise InputError(

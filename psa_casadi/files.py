@@ -250,9 +250,9 @@ def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:
     try:
         content = data.encode() if isinstance(data, str) else data
     except UnicodeEncodeError as error:
-        found = ord(error.object[error.start])
+        result = ord(error.object[error.start])
         raise InputError(
-            f"{path}: cannot write, the text has the character U+{found:04X}, which UTF-8 does not"
+            f"{path}: cannot write, the text has the character U+{result:04X}, which UTF-8 does not"
             " have; remove it from names and descriptions."
         ) from error
     with atomic_path(path) as temporary:
@@ -272,8 +272,8 @@ def why_not_written(path: str | os.PathLike[str]) -> str | None:
             )
         target.exists()
     except (OSError, RuntimeError) as error:  # a name too long; links that lead in a circle
-        said = error.strerror if isinstance(error, OSError) else error
-        return f"{path}: cannot write ({said}); choose another name."
+        statement = error.strerror if isinstance(error, OSError) else error
+        return f"{path}: cannot write ({statement}); choose another name."
     return None
 
 
@@ -297,8 +297,8 @@ def why_not_read(error: Exception) -> str:
         return "there is no such file"
     if isinstance(error, UnicodeDecodeError):
         return "it is no text in UTF-8"
-    said = error.strerror if isinstance(error, OSError) else None
-    return said.lower() if said else str(error)
+    statement = error.strerror if isinstance(error, OSError) else None
+    return statement.lower() if statement else str(error)
 
 
 def replace_durably(temporary: Path, target: Path) -> None:

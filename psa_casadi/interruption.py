@@ -46,9 +46,9 @@ _WORK: ContextVar[Work | None] = ContextVar("work", default=None)
 @contextmanager
 def interruptible_work() -> Iterator[Work]:
     """Make what runs inside one work, or part of the work that it is in; also a decorator."""
-    own = _WORK.get()
-    if own is not None:
-        yield own
+    item = _WORK.get()
+    if item is not None:
+        yield item
         return
     token = _WORK.set(Work())
     try:
@@ -64,8 +64,8 @@ def current_work() -> Work:
 
 def flag_address() -> int | None:
     """Return the address of this work's flag for compiled code, None where there is no work."""
-    own = _WORK.get()
-    return None if own is None else own.address
+    item = _WORK.get()
+    return None if item is None else item.address
 
 
 def raise_if_stopped() -> None:

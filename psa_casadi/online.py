@@ -54,8 +54,8 @@ class Block:
 
     def __init__(self, values: Mapping[str, float]) -> None:
         component = self._component
-        own = {p.name: values[p.name] for p in component.parameters}
-        model = compose([component], own, name=component.name, description=component.description)
+        table = {p.name: values[p.name] for p in component.parameters}
+        model = compose([component], table, name=component.name, description=component.description)
         self._begin(model, [state.start for state in component.sampled])
 
     @property
@@ -75,9 +75,9 @@ class Block:
         out = ca.substitute(out, s.z, after)
         self._function = ca.Function("recursion", [s.z, s.u], [after, out], {"cse": True})
         self._kept = (np.array(kept, dtype=float), np.array(kept, dtype=float))
-        given, shown = np.zeros(s.u.numel()), np.zeros(s.y.numel())
-        self._given: Any = given.data
-        self._out: Any = shown.data
+        inputs, displayed = np.zeros(s.u.numel()), np.zeros(s.y.numel())
+        self._given: Any = inputs.data
+        self._out: Any = displayed.data
         # bound to memory twice: each reads from one copy and writes to the other
         self._bound: Any = [self._function.buffer() for _ in self._kept]
         for source, (buffer, _) in enumerate(self._bound):
@@ -251,12 +251,12 @@ class _Learning(Block):
         """Parameters, force and what is left of their uncertainty after the last sample."""
         kept, p = self.kept, self.model.values
         c = constants(p)
-        found = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
+        items = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
         factors = [
             [*(kept[f"U_{i + 1}_{j + 1}"] for i in range(j)), kept[f"D_{j + 1}"]]
             for j in range(COUNT)
         ]
-        parameters, left = (dict(zip(TRACKED, v, strict=True)) for v in (found, variances(factors)))
+        parameters, left = (dict(zip(TRACKED, v, strict=True)) for v in (items, variances(factors)))
         return Estimate(parameters, kept["f_H"], left)
 
 
@@ -342,5 +342,5 @@ def part_for(
         error = noise if noise is not None else _NOISE * stroke
         values = dict(identifier_for(stack, period, noise=error).values)
     component = COMPONENTS[name]
-    own = {p.name: values[p.name] for p in component.parameters}
-    return compose([component], own, name=name, description=PARTS[name].description)
+    table = {p.name: values[p.name] for p in component.parameters}
+    return compose([component], table, name=name, description=PARTS[name].description)

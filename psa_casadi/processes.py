@@ -51,11 +51,11 @@ class Processes:
         except (EOFError, OSError, pickle.UnpicklingError):
             del self._own.child
             code = child.wait()
-            said = "" if child.stderr is None else child.stderr.read().decode(errors="replace")
+            statement = "" if child.stderr is None else child.stderr.read().decode(errors="replace")
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise MachineError(
                 f"The process that worked on this ended ({how}): killed, out of memory, or"
-                f" crashed. The next run tries it again. {said[-500:]}"
+                f" crashed. The next run tries it again. {statement[-500:]}"
             ) from None
 
 

@@ -26,18 +26,18 @@ def on_a_terminal(work: Callable[P, R]) -> Callable[P, R]:
     name = getattr(work, "__name__", "work")
 
     @wraps(work)
-    def run(*given: P.args, **words: P.kwargs) -> R:
+    def run(*inputs: P.args, **words: P.kwargs) -> R:
         if "progress" in words or not sys.stderr.isatty():
-            return work(*given, **words)
+            return work(*inputs, **words)
 
         def tell(step: str) -> None:
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"{_CLEAR}{f'{name}: {step}'[:room]}")
             sys.stderr.flush()
 
-        told: Any = {**words, "progress": tell}
+        output: Any = {**words, "progress": tell}
         try:
-            return work(*given, **told)
+            return work(*inputs, **output)
         finally:
             sys.stderr.write(_CLEAR)
             sys.stderr.flush()

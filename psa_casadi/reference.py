@@ -98,8 +98,8 @@ def simulate(
         load = _inside(load_force or (lambda _: 0.0), begin, end)
         segment = _Segment(stack, _inside(voltage, begin, end), load)
         wanted = times[(times > begin) & (times <= end)]
-        found, state = segment.integrate(begin, end, wanted, state, rtol)
-        columns.append(found)
+        result, state = segment.integrate(begin, end, wanted, state, rtol)
+        columns.append(result)
     return _trajectory(stack, np.array(times), np.hstack(columns), voltage)
 
 

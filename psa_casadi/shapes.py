@@ -123,7 +123,7 @@ def spectrum_force(
         return [sum(c * math.cos(k * x) for k, c in enumerate(terms)) for x in places]
 
     each = [weights(name, count) for name, count in zip(_POWERS, counts, strict=True)]
-    return sum(_polynomial(s, z, *own) for z, *own in zip(elements, *each, strict=True))
+    return sum(_polynomial(s, z, *item) for z, *item in zip(elements, *each, strict=True))
 
 
 def spectrum_parameters(

@@ -18,9 +18,9 @@ def register(make: Callable[..., Any]) -> None:
     _make = make
 
 
-def made(what: str, *given: Any, **options: Any) -> Any:
+def made(what: str, *inputs: Any, **options: Any) -> Any:
     """Return what the registered function makes: "line", "plot", "note_text", ..."""
-    return _make(what, *given, **options)
+    return _make(what, *inputs, **options)
 
 
 class Worded:

@@ -103,8 +103,8 @@ def mistakes(kind: Any, content: Any, place: str = "") -> Iterator[str]:
     except msgspec.ValidationError:
         inside = [m for p, k, value in _parts(kind, content, place) for m in mistakes(k, value, p)]
         name = f"'{place}'" if place else "the file"
-        found = "missing" if content is _LACKING else shown(content)
-        yield from inside or [f"{name} is {found}; give {_wanted(kind)}."]
+        result = "missing" if content is _LACKING else shown(content)
+        yield from inside or [f"{name} is {result}; give {_wanted(kind)}."]
 
 
 def _parts(kind: Any, content: Any, place: str) -> Iterable[tuple[str, Any, Any]]:
@@ -153,8 +153,8 @@ def _wanted(kind: Any) -> str:
 def plain(value: Any) -> Any:
     """Return what a file has of a record: the names with values that are not the defaults."""
     if is_dataclass(value):
-        own = [(f, getattr(value, f.name)) for f in fields(value)]
-        return {f.name: plain(v) for f, v in own if _has_no_default(f) or v != _default(f)}
+        items = [(f, getattr(value, f.name)) for f in fields(value)]
+        return {f.name: plain(v) for f, v in items if _has_no_default(f) or v != _default(f)}
     if isinstance(value, Mapping):
         return {name: plain(v) for name, v in value.items()}
     return [plain(v) for v in value] if isinstance(value, tuple) else value
@@ -170,14 +170,14 @@ def json_text(content: Any) -> str:
     """
     check_texts(content)
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return _NUMBERS.sub(lambda found: f"[{' '.join(found[1].split())}]", text)
+    return _NUMBERS.sub(lambda result: f"[{' '.join(result[1].split())}]", text)
 
 
 def check_texts(content: Any) -> None:
     """Raise ValueError for a text with a character that no document can carry."""
     for text in _texts(content):
-        if found := barred(text):
-            raise ValueError(f"the text {shown(text)} has the character {found}")
+        if result := barred(text):
+            raise ValueError(f"the text {shown(text)} has the character {result}")
 
 
 def shown(value: object) -> str:
@@ -187,11 +187,11 @@ def shown(value: object) -> str:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    table = dict(pairs)
+    if len(table) < len(pairs):
         twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
         raise ValueError(f"the name {shown(twice)} stands twice in one object")
-    return found
+    return table
 
 
 def _constant(word: str) -> Any:

@@ -19,8 +19,8 @@ def in_turn(work: Callable[P, R]) -> Callable[P, R]:
     """Return work on expressions that waits until no other thread is at such work."""
 
     @wraps(work)
-    def alone(*given: P.args, **words: P.kwargs) -> R:
+    def alone(*inputs: P.args, **words: P.kwargs) -> R:
         with _ONE:
-            return work(*given, **words)
+            return work(*inputs, **words)
 
     return alone

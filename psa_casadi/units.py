@@ -137,8 +137,8 @@ _LONGEST_SYMBOL = 24
 
 def units_of(quantity: str) -> tuple[str, ...]:
     """Return the symbols of the units of one quantity, such as "voltage", largest first."""
-    found = [unit for unit in UNITS.values() if unit.quantity == quantity]
-    return tuple(unit.name for unit in sorted(found, key=lambda unit: -unit.ratio))
+    items = [unit for unit in UNITS.values() if unit.quantity == quantity]
+    return tuple(unit.name for unit in sorted(items, key=lambda unit: -unit.ratio))
 
 
 def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
@@ -176,7 +176,9 @@ def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
             if not _SMALLEST < ratio < 1 / _SMALLEST:
                 raise InputError(_not_a_unit(text))
             counts += power * unit.counts
-            exponents = [e + power * own for e, own in zip(exponents, unit.exponents, strict=True)]
+            exponents = [
+                e + power * item for e, item in zip(exponents, unit.exponents, strict=True)
+            ]
     if counts.denominator != 1:
         raise InputError(_not_a_unit(text))
     kg, m, s, A, K, mol, cd, rad = map(_whole, exponents)
@@ -212,10 +214,10 @@ def _from_pint(symbol: str) -> Unit | None:
         return None
     ratio = Fraction(factor).limit_denominator(10**40)
     kg, m, s, A, K, mol, cd, rad, count = map(int, exponents)
-    found = Unit(symbol, ratio, float(offset), (kg, m, s, A, K, mol, cd, rad), count)
-    alike = [unit for unit in UNITS.values() if unit.dimension == found.dimension]
-    same = [u for u in alike if (u.ratio, u.offset) == (found.ratio, found.offset)]
-    return next(iter(same), replace(found, quantity=alike[0].quantity if alike else ""))
+    result = Unit(symbol, ratio, float(offset), (kg, m, s, A, K, mol, cd, rad), count)
+    items = [unit for unit in UNITS.values() if unit.dimension == result.dimension]
+    same = [u for u in items if (u.ratio, u.offset) == (result.ratio, result.offset)]
+    return next(iter(same), replace(result, quantity=items[0].quantity if items else ""))
 
 
 def _not_a_unit(text: str) -> str:

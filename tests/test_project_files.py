@@ -124,6 +124,19 @@ CLASSIFIED = [
 ]
 
 
+def test_the_conda_recipe_and_the_metadata_are_those_of_the_package() -> None:
+    text = (ROOT / "build_scripts" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
+    recipe = yaml.safe_load(text)
+    needs = {r.replace("-base", "").replace(" ", "") for r in recipe["requirements"]["run"]}
+    assert needs == {str(r) for r in CORE if r.marker is None} | {
+        f"python{PROJECT['requires-python']}"
+    }
+    versions = {recipe["context"]["version"]}
+    for file in ("CITATION.cff", "codemeta.json"):  # JSON is YAML
+        versions.add(yaml.safe_load((ROOT / file).read_text(encoding="utf-8"))["version"])
+    assert versions == {__version__}
+
+
 @cache
 def _trees() -> dict[Path, ast.Module]:
     paths = sorted((ROOT / "psa_casadi").rglob("*.py"))
@@ -148,20 +161,20 @@ def _third_party() -> frozenset[tuple[Path, str, bool]]:
 
     Each package here is imported under the name that it is installed by, in lower case.
     """
-    own = {*sys.stdlib_module_names, "psa_casadi"}
+    item = {*sys.stdlib_module_names, "psa_casadi"}
     return frozenset(
         (path, name, inside)
         for path, tree in _trees().items()
         for name, inside in _imports(tree)
-        if name not in own
+        if name not in item
     )
 
 
 @pytest.mark.parametrize("extra", ["", *EXTRAS])
 def test_every_requirement_has_a_lower_bound(extra: str) -> None:
-    found = EXTRAS[extra] if extra else CORE
-    assert found
-    for requirement in found:
+    result = EXTRAS[extra] if extra else CORE
+    assert result
+    for requirement in result:
         bounds = [s for s in requirement.specifier if s.operator == ">="]
         assert len(bounds) == (0 if requirement.name == PROJECT["name"] else 1), str(requirement)
 
@@ -184,8 +197,8 @@ def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
 
 
 def test_the_developers_install_has_every_extra() -> None:
-    (own,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
-    assert own.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
+    (item,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
+    assert item.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
 
 
 def test_the_workflow_runs_every_python_that_is_promised() -> None:
@@ -228,5 +241,5 @@ def test_every_module_can_be_imported_first(tmp_path: Path) -> None:
         [sys.executable, "-c", SCRIPT, "circle_a", *names],
         capture_output=True, text=True, check=True, cwd=tmp_path,
     )  # fmt: skip
-    (found,) = run.stdout.splitlines()  # the circle that is there, and no other
-    assert found.startswith("circle_a: ImportError")
+    (result,) = run.stdout.splitlines()  # the circle that is there, and no other
+    assert result.startswith("circle_a: ImportError")

@@ -124,28 +124,28 @@ def test_one_or_several_records_paths_and_tables_are_records(tmp_path: Path) -> 
 
 
 def test_results_are_data_frames() -> None:
-    d, found = diagnosis("cause_named"), identification()
+    d, result = diagnosis("cause_named"), identification()
     samples = d.to_frame()
     assert len(samples) == sum(e.record.n for e in d.experiments)
     rest = samples[samples.held_out]
     rms = float(np.sqrt(np.nanmean((rest["measured [m]"] - rest["base [m]"]) ** 2)))
     assert 0.0 < rms < 1e-6
-    parameters = found.to_frame().set_index("parameter")
-    assert parameters.value.to_dict() == dict(found.model.values)
+    parameters = result.to_frame().set_index("parameter")
+    assert parameters.value.to_dict() == dict(result.model.values)
     assert (parameters.low <= parameters.value)[parameters.low.notna()].all()
-    table = psa.simulate(found.model, T, V).to_frame()
+    table = psa.simulate(result.model, T, V).to_frame()
     assert {"time [s]", "measured_displacement [m]", "f_H [N]"} <= {*table}
 
 
 def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:
-    d, found = diagnosis("cause_named"), identification()
-    run, record = psa.simulate(found.model, T, V), d.experiments[0].record
+    d, matches = diagnosis("cause_named"), identification()
+    run, record = psa.simulate(matches.model, T, V), d.experiments[0].record
     axes = Figure().add_subplot()
     assert run.plot(ax=axes, output="f_H") is axes.figure
     (curve,) = axes.lines
     np.testing.assert_array_equal(curve.get_ydata(), run.states["f_H"])
     assert axes.get_ylabel() == "f_H [N]"
-    for result, curves in ((run, 1), (record, 1), (d, 3), (found, 2)):
+    for result, curves in ((run, 1), (record, 1), (d, 3), (matches, 2)):
         (one,) = result.plot(output="displacement").axes
         assert one.get_ylabel().startswith("displacement [")
         assert len(one.lines) == curves
@@ -178,10 +178,10 @@ def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
 
 def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    for text, said in (("{}", "no diagnosis"), ("[", "x.json"), (
+    for text, statement in (("{}", "no diagnosis"), ("[", "x.json"), (
         '{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing")):  # fmt: skip
         path.write_text(text, encoding="utf-8")
-        with pytest.raises(psa.InputError, match=said):
+        with pytest.raises(psa.InputError, match=statement):
             psa.load_diagnosis(path)
     with pytest.raises(psa.InputError, match=r"none\.json"):
         psa.load_diagnosis(tmp_path / "none.json")
@@ -376,10 +376,10 @@ def test_another_process_predicts_the_same(tmp_path: Path) -> None:
         "models = pickle.load(open(sys.argv[1], 'rb'));"
         "np.savez(sys.argv[2], *[driven(m)[0] for m in models])"
     )
-    given = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
-    subprocess.run([sys.executable, "-c", code, *given], check=True)
-    with np.load(tmp_path / "y.npz") as found:
-        for model, y in zip(models, found.values(), strict=True):
+    items = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
+    subprocess.run([sys.executable, "-c", code, *items], check=True)
+    with np.load(tmp_path / "y.npz") as result:
+        for model, y in zip(models, result.values(), strict=True):
             np.testing.assert_array_equal(y, driven(model)[0])
 
 
@@ -394,7 +394,7 @@ def test_another_fmu_in_its_place_is_told(tmp_path: Path) -> None:
 @slow
 def test_a_posterior_is_pickled() -> None:
     record = identification().experiments[1].record
-    found = psa.sample(identification().model, [record], draws=20, tune=20, chains=2)
-    again = pickle.loads(pickle.dumps(found))
-    assert again.figures == found.figures
-    np.testing.assert_array_equal(again.tree.posterior["k_L"], found.tree.posterior["k_L"])
+    result = psa.sample(identification().model, [record], draws=20, tune=20, chains=2)
+    again = pickle.loads(pickle.dumps(result))
+    assert again.figures == result.figures
+    np.testing.assert_array_equal(again.tree.posterior["k_L"], result.tree.posterior["k_L"])

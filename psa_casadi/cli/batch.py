@@ -30,7 +30,7 @@ def batch(
     hysteresis: Hysteresis = None,
     reading: Reading,
     fitting: Fitting,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Identify or diagnose many devices, each by itself, on all cores or a cluster.
 
@@ -56,41 +56,41 @@ def batch(
     from psa_casadi.population.population import population
     from psa_casadi.report.words.population_words import missed_sentences
 
-    given.stiffness(stiffness)
-    own = own_model(given, model, fitting)
-    if own is None:
-        given.columns(reading.columns)
-        given.model(model)
-    given.outputs({"--report": report}, [model])
-    jobs = given.attempt(lambda: jobs_given(records))
-    given.check()
-    text = model.read_text(encoding="utf-8-sig") if model and own is None else None
+    inputs.stiffness(stiffness)
+    item = own_model(inputs, model, fitting)
+    if item is None:
+        inputs.columns(reading.columns)
+        inputs.model(model)
+    inputs.outputs({"--report": report}, [model])
+    jobs = inputs.attempt(lambda: jobs_given(records))
+    inputs.check()
+    text = model.read_text(encoding="utf-8-sig") if model and item is None else None
     options = psa.Options(
-        work=work, model=own or text, stiffness=stiffness, hysteresis=hysteresis,
+        work=work, model=item or text, stiffness=stiffness, hysteresis=hysteresis,
         columns=reading.columns, sample_time=reading.sample_time,
-        modules=tuple(given.effects or ()), words=fitting.words,
+        modules=tuple(inputs.effects or ()), words=fitting.words,
     )  # fmt: skip
-    found = None
-    with ExitStack() as held, working("batch", given.quiet) as progress:
+    result = None
+    with ExitStack() as held, working("batch", inputs.quiet) as progress:
         client = held.enter_context(dask_client(dask, workers)) if dask else None
         done = psa.batch(
             jobs or (), output, options=options, executor=client, workers=workers,
             progress=progress,
         )  # fmt: skip
         with suppress(psa.InputError):  # too few devices tell a parameter
-            found = population(done.findings) if report is not None else None
+            result = population(done.findings) if report is not None else None
     rows = [(d, (d.device, d.status, " ".join(d.problems))) for d in done.devices]
-    if report is not None and found is not None:
-        psa.write_population(found, report, without=[row for d, row in rows if d.problems])
+    if report is not None and result is not None:
+        psa.write_population(result, report, without=[row for d, row in rows if d.problems])
     counts = ", ".join(f"{n} {status}" for status, n in done.counts.items())
     kept = f"; {done.kept} of them were there before" if done.kept else ""
-    show(f"{len(done.devices)} devices: {counts}{kept}.", given.quiet)
-    tell_lost([row for d, row in rows if d.status != "done"], done.files[0], given.quiet)
+    show(f"{len(done.devices)} devices: {counts}{kept}.", inputs.quiet)
+    tell_lost([row for d, row in rows if d.status != "done"], done.files[0], inputs.quiet)
     for sentence in missed_sentences(done.findings):
-        show(sentence, given.quiet)
-    tell_written(*done.files, report if found else None, quiet=given.quiet)
-    if report is not None and found is None:
-        show(f"{report} was not written: fewer than four devices tell a parameter.", given.quiet)
+        show(sentence, inputs.quiet)
+    tell_written(*done.files, report if result else None, quiet=inputs.quiet)
+    if report is not None and result is None:
+        show(f"{report} was not written: fewer than four devices tell a parameter.", inputs.quiet)
     if not done.findings:
         raise typer.Exit(1)
 

@@ -28,7 +28,7 @@ def check(
     junit: Path | None = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=1e6)] = 600.0,
     memory: Annotated[int, typer.Option(min=64)] = 4096,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
@@ -60,21 +60,21 @@ def check(
     from psa_casadi.strict_json import json_text
 
     began = time.perf_counter()
-    given.outputs({"--json": json, "--junit": junit}, [fmu, model])
+    inputs.outputs({"--json": json, "--junit": junit}, [fmu, model])
     if not fmu.is_file():
         what = "is a directory" if fmu.is_dir() else "there is no such file"
-        given.add(f"{fmu}: {what}; name an FMU.")
-    chosen = given.model_or_stack(model, stack, any_model=True, needed=False)
-    records = given.records(record, Reading(columns=columns)) if record else ()
-    given.check()
-    with working("checking", given.quiet):
+        inputs.add(f"{fmu}: {what}; name an FMU.")
+    chosen = inputs.model_or_stack(model, stack, any_model=True, needed=False)
+    records = inputs.records(record, Reading(columns=columns)) if record else ()
+    inputs.check()
+    with working("checking", inputs.quiet):
         report = psa.check_fmu(
-            fmu, chosen, effects=given.own, timeout=timeout, memory=memory << 20,
+            fmu, chosen, effects=inputs.own, timeout=timeout, memory=memory << 20,
             evidence=evidence, records=records, portable=portable, foreign=foreign or None,
         )  # fmt: skip
-    show_table(check_table(report), given.quiet)
-    show(f"\n{check_sentence(report)}", given.quiet)
+    show_table(check_table(report), inputs.quiet)
+    show(f"\n{check_sentence(report)}", inputs.quiet)
     if json is not None:
         atomic_write(json, json_text(check_file(report)))
-        tell_written(json, quiet=given.quiet)
+        tell_written(json, quiet=inputs.quiet)
     judge("check", fmu.name, check_cases(report), junit, began)

@@ -8,7 +8,7 @@ from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.screen import show_results, tell_written, working
 
 
-def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Given) -> None:
+def compare(files: list[Path], *, output: Path = Path("compare.html"), inputs: Given) -> None:
     """Compare two or more devices side by side, or a population of many; write the page of that.
 
     A model and a diagnosis of the same records are one device. The page needs no network.
@@ -27,18 +27,18 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), given: Gi
     from psa_casadi.report.words.tables import Table
 
     tables: tuple[Table, ...] = ()
-    given.outputs({"--output": output}, files, page="--output")
-    given.check()
-    with working("comparing", given.quiet):
+    inputs.outputs({"--output": output}, files, page="--output")
+    inputs.check()
+    with working("comparing", inputs.quiet):
         if len(files) == 1 and files[0].is_dir():
-            found, lost = read_results(files[0], given.own)
-            tell_lost(lost, output, given.quiet)
-            shown = population(found)
-            psa.write_population(shown, output, without=lost)
-            told = population_sentences(shown)
+            result, lost = read_results(files[0], inputs.own)
+            tell_lost(lost, output, inputs.quiet)
+            displayed = population(result)
+            psa.write_population(displayed, output, without=lost)
+            texts = population_sentences(displayed)
         else:
-            compared = psa.compare(*files, effects=given.own)
+            compared = psa.compare(*files, effects=inputs.own)
             compared.report(output)
-            told, tables = (compared.sentence,), compared.tables
-    show_results(told, tables, given.quiet)
-    tell_written(output, quiet=given.quiet)
+            texts, tables = (compared.sentence,), compared.tables
+    show_results(texts, tables, inputs.quiet)
+    tell_written(output, quiet=inputs.quiet)

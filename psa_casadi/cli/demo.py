@@ -79,17 +79,17 @@ def demo(
         compiled_ahead(searched, first=[make_compiler_ready]),
     ):
         psa.save_model(identify([record], progress=progress).model, paths["model.json"])
-    with ThreadPoolExecutor(1) as beside, working("diagnosing", quiet, DIAGNOSE) as progress:
+    with ThreadPoolExecutor(1) as others, working("diagnosing", quiet, DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
-        exported = beside.submit(psa.export_fmu, d.model, paths["extended.fmu"])
-        beside.submit(make_ready, d.model.plant())  # the check simulates with it
+        exported = others.submit(psa.export_fmu, d.model, paths["extended.fmu"])
+        others.submit(make_ready, d.model.plant())  # the check simulates with it
         psa.save_model(d.model, paths["extended.json"])
         atomic_write(paths["diagnosis.json"], d.to_json())
         extended = str(paths["extended.json"])
         psa.write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
         psa.save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
-    told = psa.story(d, origin=_ORIGIN, width=width(), model_file=extended)
-    show(f"\n{told}\n\n{HIDDEN}\n", quiet)
+    text = psa.story(d, origin=_ORIGIN, width=width(), model_file=extended)
+    show(f"\n{text}\n\n{HIDDEN}\n", quiet)
     with working("exporting and checking the FMU", quiet):
         exported.result()
         checked = psa.check_fmu(paths["extended.fmu"], d.model)
@@ -107,9 +107,9 @@ def _prepared(named: Path | None, output: Path | None) -> tuple[Path, dict[str, 
         raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
     directory = named or output or Path("psa_demo")
     make_folder(directory)
-    paths, given = {name: directory / name for name in FILES}, Given()
-    given.outputs(paths, [])
-    given.check()
+    paths, inputs = {name: directory / name for name in FILES}, Given()
+    inputs.outputs(paths, [])
+    inputs.check()
     packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")
     atomic_write(paths[RECORD], packaged.read_bytes())
     return directory, paths

@@ -47,7 +47,7 @@ def experiment(
     still: bool = False,
     reading: Reading,
     fitting: Fitting,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
 
@@ -90,8 +90,8 @@ def experiment(
     from psa_casadi.design.experiment.search import Effort
     from psa_casadi.report.words.design_words import design_tables, sentences
 
-    given.outputs({"--output": output, "--report": report}, [model, *(record or [])])
-    chosen = own_model(given, model, fitting)
+    inputs.outputs({"--output": output, "--report": report}, [model, *(record or [])])
+    chosen = own_model(inputs, model, fitting)
     wanted = {
         "low": low, "high": high, "duration": duration, "samples": samples,
         "rate": rate, "current": current, "bandwidth": bandwidth,
@@ -100,14 +100,14 @@ def experiment(
     records: Sequence[psa.Signals]
     if chosen is not None:
         stacks_own = ("low", "high", "current")
-        given.refuse({"--stack": stack, **{f"--{n}": wanted[n] for n in stacks_own}})
-        records = given.signals(chosen, record or [], reading)
-        own = {c.name: c for c in given.of_any_model()}
-        effects = [own.get(n, n) for n in effects]
+        inputs.refuse({"--stack": stack, **{f"--{n}": wanted[n] for n in stacks_own}})
+        records = inputs.signals(chosen, record or [], reading)
+        table = {c.name: c for c in inputs.of_any_model()}
+        effects = [table.get(n, n) for n in effects]
     else:
-        records = given.records(record, reading) if record else []
-        effects = _stacks_effects(given, effects)
-        chosen = given.model_or_stack(model, stack)
+        records = inputs.records(record, reading) if record else []
+        effects = _stacks_effects(inputs, effects)
+        chosen = inputs.model_or_stack(model, stack)
     for wrong, sentence in (
         (
             len(effects) == 1,
@@ -124,11 +124,11 @@ def experiment(
         (starts < 1, f"--starts is {starts}; give 1 or more."),
     ):
         if wrong:
-            given.add(sentence)
-    limits = given.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
-    level = given.attempt(lambda: _noise(chosen, noise or []))
-    chosen, limits = given.ready(chosen), given.ready(limits)
-    with working("designing an experiment", given.quiet) as progress:
+            inputs.add(sentence)
+    limits = inputs.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
+    level = inputs.attempt(lambda: _noise(chosen, noise or []))
+    chosen, limits = inputs.ready(chosen), inputs.ready(limits)
+    with working("designing an experiment", inputs.quiet) as progress:
         design = design_experiment(
             chosen, limits, records=records, separate=effects, parameters=parameter or [],
             optimality=optimality, noise=level, correlation=correlation,
@@ -140,20 +140,20 @@ def experiment(
         if report is not None:
             _write_page(report, design, chosen, still)
     for sentence in sentences(design):
-        show(sentence, given.quiet)
-    for shown in design_tables(design):
-        show(f"\n{shown.title}\n", given.quiet)
-        show_table(shown.table, given.quiet)
-    tell_written(output, report, quiet=given.quiet)
+        show(sentence, inputs.quiet)
+    for displayed in design_tables(design):
+        show(f"\n{displayed.title}\n", inputs.quiet)
+        show_table(displayed.table, inputs.quiet)
+    tell_written(output, report, quiet=inputs.quiet)
 
 
-def _stacks_effects(given: Given, wanted: Sequence[str]) -> "list[psa.Component]":
+def _stacks_effects(inputs: Given, wanted: Sequence[str]) -> "list[psa.Component]":
     """Return the effects of a stack to separate; all mistakes are noted."""
     from psa_casadi.model.own_effects import known_effects
 
-    table = known_effects(given.own)
+    table = known_effects(inputs.own)
     for name in [n for n in wanted if n not in table]:
-        given.add(f"There is no effect '{name}'; `psa effects` lists them.")
+        inputs.add(f"There is no effect '{name}'; `psa effects` lists them.")
     return [table[n] for n in wanted if n in table]
 
 
@@ -169,18 +169,18 @@ def _limits(
 
     if model is None:
         return {}
-    said = {k: v for k, v in wanted.items() if v is not None}
+    statement = {k: v for k, v in wanted.items() if v is not None}
     if is_stack(model) and records:
         return {"voltage": limits_of(records, **wanted)}
-    if "duration" not in said:
+    if "duration" not in statement:
         raise InputError("No length is given; add --duration SECONDS, or --record with records.")
-    samples = int(said.pop("samples", _SAMPLES))
+    samples = int(statement.pop("samples", _SAMPLES))
     if is_stack(model):
-        said = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **said}
-        if not said["high"]:
+        statement = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **statement}
+        if not statement["high"]:
             raise InputError("The model has no rated voltage; add --high VOLTS.")
-        return {"voltage": Limits(samples=samples, **said)}
-    found = {}
+        return {"voltage": Limits(samples=samples, **statement)}
+    table = {}
     for text in inputs:
         name, _, figures = text.partition("=")
         try:
@@ -189,31 +189,31 @@ def _limits(
             raise InputError(
                 f"--input is '{text}'; give NAME=LOW:HIGH, such as {model.input_names[0]}=0:10."
             ) from None
-        own = {**said, "rate": steepest[0]} if steepest else said
-        found[name] = Limits(low=low, high=high, samples=samples, **own)
-    if not found:
+        item = {**statement, "rate": steepest[0]} if steepest else statement
+        table[name] = Limits(low=low, high=high, samples=samples, **item)
+    if not table:
         raise InputError(
             f"No input may move; add --input NAME=LOW:HIGH, of {', '.join(model.input_names)}."
         )
-    return found
+    return table
 
 
 def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] | float | None:
     """Return the noise of every output as given: that of a stack in nm, else in its unit."""
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for text in texts:
         name, _, figure = text.rpartition("=")
         try:
-            found[name] = float(figure)
+            values[name] = float(figure)
         except ValueError:
             raise InputError(f"--noise is '{text}'; give a number, or NAME=RMS.") from None
-        if not found[name] > 0.0:
+        if not values[name] > 0.0:
             raise InputError(f"--noise is {text}; give the positive rms of the sensor's noise.")
-    if "" in found:
+    if "" in values:
         from psa_casadi.simulation.start import is_stack
 
-        return found[""] * (1e-9 if model is None or is_stack(model) else 1.0)
-    return found or None
+        return values[""] * (1e-9 if model is None or is_stack(model) else 1.0)
+    return values or None
 
 
 def _write_page(path: Path, design: Any, model: "psa.Model", still: bool) -> None:

@@ -23,7 +23,7 @@ def input_(
     report: Path | None = None,
     check_fmu: bool = True,
     still: bool = False,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Design the voltage for a path or for a quickest move; test it on simulator and FMU.
 
@@ -48,26 +48,26 @@ def input_(
     from psa_casadi.cli import design_input_runs as runs
     from psa_casadi.design.tracking.targets import AmplifierLimits, read_target
 
-    given.outputs({"--output": output, "--report": report}, [model, target, measured])
+    inputs.outputs({"--output": output, "--report": report}, [model, target, measured])
     if (target is None) == (move is None):
-        given.add("Give one of --target PATH.csv and --move FROM TO: the path, or the two ends.")
+        inputs.add("Give one of --target PATH.csv and --move FROM TO: the path, or the two ends.")
     ways = {"--fast": fast, "--minimax": minimax, "--measured": measured is not None}
     wanted = " and ".join(name for name, chosen in ways.items() if chosen)
     if sum(ways.values()) > 1:
-        given.add(f"{wanted} exclude each other; leave all but one of them out.")
+        inputs.add(f"{wanted} exclude each other; leave all but one of them out.")
     if move is not None and target is None and wanted:
-        given.add(f"{wanted}: for a path only; leave it out with --move.")
+        inputs.add(f"{wanted}: for a path only; leave it out with --move.")
     numbers = {
         "min_voltage": min_voltage, "max_voltage": max_voltage,
         "max_rate": max_rate, "max_current": max_current,
     }  # fmt: skip
     named = {name: value for name, value in numbers.items() if value is not None}
-    limits = given.attempt(lambda: AmplifierLimits(**named))
-    path = given.attempt(lambda: read_target(target)) if target is not None else None
-    trial = given.records([measured], Reading()) if measured is not None else []
-    chosen = given.model_or_stack(model, stack)
-    plant, limits = given.ready(chosen).plant(), given.ready(limits)
-    task = runs.Task(plant, limits, output, report, still, check_fmu, given.quiet)
+    limits = inputs.attempt(lambda: AmplifierLimits(**named))
+    path = inputs.attempt(lambda: read_target(target)) if target is not None else None
+    trial = inputs.records([measured], Reading()) if measured is not None else []
+    chosen = inputs.model_or_stack(model, stack)
+    plant, limits = inputs.ready(chosen).plant(), inputs.ready(limits)
+    task = runs.Task(plant, limits, output, report, still, check_fmu, inputs.quiet)
     if move is not None:
         runs.move(task, move)
     elif path is not None and trial:

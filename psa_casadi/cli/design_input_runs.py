@@ -42,65 +42,77 @@ class Task:
 def track(task: Task, path: targets.Target, minimax: bool) -> None:
     """Design the voltage for a path."""
     with working("designing", task.quiet) as progress:
-        found = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
+        result = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
         plain = targets.uncompensated(task.plant, path).displacement
-        rows: _Rows = [("designed, full simulator", found.error)]
-        for reached in _on_fmu(task, found.response, progress):
+        rows: _Rows = [("designed, full simulator", result.error)]
+        for reached in _on_fmu(task, result.response, progress):
             rows.append(("designed, exported FMU", targets.error_of(path, reached)))
-    said = f"{len(path.time)} samples in {number(found.seconds)} s"
-    if found.by_program:
-        rows.append(("designed, the program itself", targets.error_of(path, found.predicted)))
+    text = f"{len(path.time)} samples in {number(result.seconds)} s"
+    if result.by_program:
+        rows.append(("designed, the program itself", targets.error_of(path, result.predicted)))
         how = [
-            f"{said}, {found.iterations} iterations of IPOPT.",
-            f"Kinks at reversals were rounded over {number(found.width)} V/s in the program only.",
+            f"{text}, {result.iterations} iterations of IPOPT.",
+            f"Kinks at reversals were rounded over {number(result.width)} V/s in the program only.",
         ]
-        if not found.converged:
+        if not result.converged:
             how.append("IPOPT ran out of iterations: a better voltage within limits may exist.")
     else:
         how = [
-            f"{said}.",
+            f"{text}.",
             "The program (IPOPT) found no better voltage within the limits, so this is the"
             " inversion cut by them and corrected by trials on the simulator. A better one may"
             " exist.",
         ]
     rows += [
-        ("inversion without limits, full simulator", found.inverse.error),
+        ("inversion without limits, full simulator", result.inverse.error),
         ("uncompensated, full simulator", targets.error_of(path, plain)),
     ]
-    summary = [_follows(found.error), *targets.binding(found.response, task.limits), *how]
+    summary = [_follows(result.error), *targets.binding(result.response, task.limits), *how]
     badge = "least largest error" if minimax else "least squares"
-    pictures = designs.tracking_pictures(found, plain)
-    _finish(task, "Designed input", summary, rows, pictures, found.response, badge, path=path)
+    pictures = designs.tracking_pictures(result, plain)
+    _finish(task, "Designed input", summary, rows, pictures, result.response, badge, path=path)
 
 
 def invert(task: Task, path: targets.Target) -> None:
     """Invert the model along a path; the limits cut the voltage."""
     with working("inverting", task.quiet) as progress:
-        found = inverted(task.plant, path, task.limits)
-        rows: _Rows = [("inversion, full simulator", found.error)]
-        for reached in _on_fmu(task, found.response, progress):
+        result = inverted(task.plant, path, task.limits)
+        rows: _Rows = [("inversion, full simulator", result.error)]
+        for reached in _on_fmu(task, result.response, progress):
             rows.append(("inversion, exported FMU", targets.error_of(path, reached)))
-    summary = [_follows(found.error), *targets.binding(found.response, task.limits)]
-    summary.append(f"{len(found.trials)} trials on the simulator.")
-    pictures = designs.inversion_pictures(found, task.limits)
-    _finish(task, "Inverted input", summary, rows, pictures, found.response, "inversion", path=path)
+    summary = [_follows(result.error), *targets.binding(result.response, task.limits)]
+    summary.append(f"{len(result.trials)} trials on the simulator.")
+    pictures = designs.inversion_pictures(result, task.limits)
+    _finish(
+        task, "Inverted input", summary, rows, pictures, result.response, "inversion", path=path
+    )
 
 
 def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     """Correct the voltage of a trial by what it showed."""
     with working("correcting", task.quiet):
-        found = corrected(task.plant, path, trial, task.limits)
-    change = float(np.max(np.abs(found.response.voltage - found.played)))
+        result = corrected(task.plant, path, trial, task.limits)
+    change = float(np.max(np.abs(result.response.voltage - result.played)))
     summary = [
-        f"The trial missed the path by {number(found.error.rms_percent)} % of its range rms,"
-        f" {number(found.error.largest_percent)} % at most.",
+        f"The trial missed the path by {number(result.error.rms_percent)} % of its range rms,"
+        f" {number(result.error.largest_percent)} % at most.",
         f"The voltage changes by {number(change)} V at most; only the next trial can show what that"
         " is worth.",
-        *targets.binding(found.response, task.limits),
+        *targets.binding(result.response, task.limits),
     ]
-    rows, pictures = [("the trial, measured", found.error)], designs.trial_pictures(found)
+    rows, pictures = (
+        [("the trial, measured", result.error)],
+        designs.trial_pictures(result),
+    )
     _finish(
-        task, "Corrected input", summary, rows, pictures, found.response, "one trial", path=path
+        task,
+        "Corrected input",
+        summary,
+        rows,
+        pictures,
+        result.response,
+        "one trial",
+        path=path,
     )
 
 
@@ -108,20 +120,20 @@ def move(task: Task, ends: tuple[float, float]) -> None:
     """Design a quickest move between two positions [um]."""
     with working("designing", task.quiet) as progress:
         begin, end = (1e-6 * position for position in ends)
-        found = quickest_move(task.plant, begin, end, task.limits, progress=progress)
+        quick = quickest_move(task.plant, begin, end, task.limits, progress=progress)
         summary = [
-            f"The move takes {number(1e6 * found.move_time)} us; the linear part alone would take"
-            f" {number(1e6 * found.linear_time)} us.",
-            f"Behind it the displacement swings by {number(100.0 * found.residual, 2)} % of the"
-            f" move at most, {number(100.0 * found.offset, 2)} % off its end, by the simulator.",
+            f"The move takes {number(1e6 * quick.move_time)} us; the linear part alone would take"
+            f" {number(1e6 * quick.linear_time)} us.",
+            f"Behind it the displacement swings by {number(100.0 * quick.residual, 2)} % of the"
+            f" move at most, {number(100.0 * quick.offset, 2)} % off its end, by the simulator.",
         ]
-        for reached in _on_fmu(task, found.response, progress):
-            worst = np.max(np.abs(reached - found.response.displacement)) / abs(end - begin)
+        for reached in _on_fmu(task, quick.response, progress):
+            worst = np.max(np.abs(reached - quick.response.displacement)) / abs(end - begin)
             summary.append(
                 f"The exported FMU differs from the simulator by {number(100.0 * worst, 2)} % of"
                 " the move at most."
             )
-    _finish(task, "Quickest move", summary, [], designs.move_pictures(found), found.response)
+    _finish(task, "Quickest move", summary, [], designs.move_pictures(quick), quick.response)
 
 
 def _follows(error: targets.TrackingError) -> str:
@@ -138,8 +150,8 @@ def _keeping(task: Task, response: targets.Response) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         _write(task, response)
-        told = kept("the voltage was designed before", [task.output], [task.report])
-        raise KeyboardInterrupt(told) from None
+        output = kept("the voltage was designed before", [task.output], [task.report])
+        raise KeyboardInterrupt(output) from None
 
 
 def _write(task: Task, response: targets.Response) -> None:

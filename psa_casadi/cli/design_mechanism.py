@@ -28,7 +28,7 @@ def mechanism(
     port: Path | None = None,
     report: Path | None = None,
     still: bool = False,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.
 
@@ -61,15 +61,15 @@ def mechanism(
         pole_table,
     )
 
-    given.outputs({"--output": output, "--port": port, "--report": report}, [model])
-    chosen = given.model_or_stack(model, stack)
-    wanted = given.attempt(lambda: _poles(poles))
-    loss = given.attempt(lambda: _share(max_stroke_loss))
+    inputs.outputs({"--output": output, "--port": port, "--report": report}, [model])
+    chosen = inputs.model_or_stack(model, stack)
+    wanted = inputs.attempt(lambda: _poles(poles))
+    loss = inputs.attempt(lambda: _share(max_stroke_loss))
     limits = Limits(loss or 0.0, max_force, (min_mass, max_mass), (0.0, max_damping))
     if wanted is not None:
-        given.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
-    chosen, goals = given.ready(chosen), given.ready(wanted)
-    with working("designing", given.quiet) as progress:
+        inputs.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
+    chosen, goals = inputs.ready(chosen), inputs.ready(wanted)
+    with working("designing", inputs.quiet) as progress:
         progress(f"{starts} starts")
         design = psa.design_mechanism(
             chosen, damping=damping, bandwidth=bandwidth, poles=goals, limits=limits,
@@ -81,23 +81,23 @@ def mechanism(
     if report is not None:
         write_mechanism_page(design, report, chosen, still=still)
     tables = mechanism_table(design), pole_table(design)
-    show_results(mechanism_sentences(design), tables, given.quiet)
-    tell_written(output, port, report, quiet=given.quiet)
+    show_results(mechanism_sentences(design), tables, inputs.quiet)
+    tell_written(output, port, report, quiet=inputs.quiet)
 
 
 def _poles(text: str | None) -> tuple[complex, ...]:
     """Read poles in rad/s, such as -4e4+4e4j,-4e4-4e4j."""
-    found = []
+    items = []
     for part in (text or "").split(","):
         if not part.strip():
             continue
         try:
-            found.append(complex(part.replace(" ", "").replace("i", "j")))
+            items.append(complex(part.replace(" ", "").replace("i", "j")))
         except ValueError as error:
             raise InputError(
                 f"--poles: '{part.strip()}' is no pole; write -4e4+4e4j,-4e4-4e4j in rad/s."
             ) from error
-    return tuple(found)
+    return tuple(items)
 
 
 def _share(text: str) -> float:

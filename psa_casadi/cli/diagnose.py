@@ -43,7 +43,7 @@ def diagnose(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
@@ -85,37 +85,37 @@ def diagnose(
     }  # fmt: skip
     began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
     healthy = reference or []
-    own = own_model(given, model, fitting)
+    item = own_model(inputs, model, fitting)
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
             from psa_casadi.diagnosis.result import DiagnosisInterrupted
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
-            _demand_model_name(given, output)
-            beside = {"--next": next_, "--events": events, "--junit": junit}
-            given.outputs({**outputs, **beside}, [*records, *held, *healthy, model, fitting.fmu])
-            if own is None:
+            _demand_model_name(inputs, output)
+            table = {"--next": next_, "--events": events, "--junit": junit}
+            inputs.outputs({**outputs, **table}, [*records, *held, *healthy, model, fitting.fmu])
+            if item is None:
                 run = _of_stack(
                     (records, held, healthy),
                     model,
                     (stack, stiffness, hysteresis),
                     reading,
-                    given,
+                    inputs,
                     left_out,
                 )
-                _keep_apart(given, output, model)
+                _keep_apart(inputs, output, model)
             else:
                 run = own_diagnosis(
-                    own, records, held, fitting, reading, given, leave_out=left_out,
+                    item, records, held, fitting, reading, inputs, leave_out=left_out,
                     others={
                         "--reference": healthy, "--next": next_, "--stack": stack,
                         "--stiffness": stiffness, "--hysteresis": hysteresis,
                     },
                 )  # fmt: skip
-            wanted = files.expected(given, expect, max_error)
-            given.check()
-        with working("diagnosing", given.quiet, DIAGNOSE) as progress, events_to(events) as watch:
+            wanted = files.expected(inputs, expect, max_error)
+            inputs.check()
+        with working("diagnosing", inputs.quiet, DIAGNOSE) as progress, events_to(events) as watch:
             try:
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
@@ -124,22 +124,22 @@ def diagnose(
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
             path = str(output) if output else None
-            told = psa.story(d, origin=origin, width=width(), model_file=path)
-    show(told, given.quiet)
-    _tell_files(d, outputs, unpatched, given.quiet)
+            text = psa.story(d, origin=origin, width=width(), model_file=path)
+    show(text, inputs.quiet)
+    _tell_files(d, outputs, unpatched, inputs.quiet)
     if timings:
-        show("", given.quiet)
-        show_table(timings_table(spent.stages), given.quiet)
+        show("", inputs.quiet)
+        show_table(timings_table(spent.stages), inputs.quiet)
         show(
-            f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", given.quiet
+            f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", inputs.quiet
         )
     subject = ", ".join(p.name for p in records)
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 
 
-def _demand_model_name(given: Given, output: Path | None) -> None:
+def _demand_model_name(inputs: Given, output: Path | None) -> None:
     if output is not None and output.suffix.lower() in (".fmu", ".ssp", ".ssv"):
-        given.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
+        inputs.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
 
 
 def _of_stack(
@@ -147,7 +147,7 @@ def _of_stack(
     model: Path | None,
     device: tuple[StackName, float | None, Hysteresis],
     reading: Reading,
-    given: Given,
+    inputs: Given,
     left_out: Sequence[str],
 ) -> Callable[..., psa.Diagnosis]:
     """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
@@ -158,14 +158,14 @@ def _of_stack(
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
     stack, stiffness, hysteresis = device
-    table = _searched(given, left_out)
-    given.stiffness(stiffness)
+    table = _searched(inputs, left_out)
+    inputs.stiffness(stiffness)
     new, held, healthy = paths
-    found = given.records([*new, *healthy], reading, held)
-    first, last = len(new), given.fitted
-    start = given.model_or_stack(model, stack, needed=False)
+    result = inputs.records([*new, *healthy], reading, held)
+    first, last = len(new), inputs.fitted
+    start = inputs.model_or_stack(model, stack, needed=False)
     return partial(
-        run, found[:first], reference=found[first:last], holdout=found[last:], model=start,
+        run, result[:first], reference=result[first:last], holdout=result[last:], model=start,
         stiffness=stiffness, hysteresis=hysteresis, effects=table,
     )  # fmt: skip
 
@@ -198,21 +198,21 @@ def _finish(
         raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
 
 
-def _keep_apart(given: Given, output: Path | None, model: Path | None) -> None:
+def _keep_apart(inputs: Given, output: Path | None, model: Path | None) -> None:
     """Demand that no model written beside the output is the one that is read."""
     if output is None or model is None or model.resolve().parent != output.resolve().parent:
         return
     if fnmatch(model.name, f"{output.stem}_*_for_*.json"):
-        given.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
+        inputs.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
 
 
-def _searched(given: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
+def _searched(inputs: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
     """Return the effects to search, without those that --leave-out names."""
     from psa_casadi.model.own_effects import known_effects
 
-    known = known_effects(given.own)
+    known = known_effects(inputs.own)
     for name in dict.fromkeys(n for n in left_out if n not in known):
-        given.add(
+        inputs.add(
             f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects` lists"
             " them."
         )
@@ -225,9 +225,9 @@ def _tell_files(
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
-    shown = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    items = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
     following = d.next_experiment.voltage_csv if isinstance(d, psa.StackDiagnosis) else None
-    tell_written(*shown, following, quiet=quiet)
+    tell_written(*items, following, quiet=quiet)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
         show(line, quiet)
 

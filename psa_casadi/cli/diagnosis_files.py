@@ -101,8 +101,8 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    told, same = one_of_each(d.contenders, d.experiments)
-    if same and len(told) < 2:
+    output, same = one_of_each(d.contenders, d.experiments)
+    if same and len(output) < 2:
         return d
     before = d.next_experiment
     try:
@@ -133,20 +133,20 @@ def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str]
 
 
 def expected(
-    given: Given, verdicts: str | None, max_error: str | None
+    inputs: Given, verdicts: str | None, max_error: str | None
 ) -> tuple[tuple[str, ...], float | None]:
     """Return the verdicts of which one must come out, and the largest held-out error [%]."""
     words = [re.sub(r"[\s-]+", "_", w.strip().lower()) for w in (verdicts or "").split(",")]
     wanted, there = tuple(dict.fromkeys(w for w in words if w)), f"there are {', '.join(VERDICTS)}."
     if verdicts is not None and not wanted:
-        given.add(f"--expect names no verdict; {there}")
+        inputs.add(f"--expect names no verdict; {there}")
     for word in wanted:
         if word not in VERDICTS:
-            given.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
-    found = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
-    largest = float(found[1]) if found else 0.0
+            inputs.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
+    matches = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
+    largest = float(matches[1]) if matches else 0.0
     if max_error is not None and not largest > 0.0:
-        given.add(
+        inputs.add(
             f"--max-error is '{max_error}'; give a positive percentage of the range, as 0.5%."
         )
     return wanted, None if max_error is None else largest
@@ -160,7 +160,7 @@ def cases(d: result.Diagnosis, wanted: tuple[str, ...], max_error: float | None)
     large, shares = "", of_range(d, extended=True)
     worst = max(shares, key=lambda output: shares[output])
     output = f" of {worst}" if len(shares) > 1 else ""
-    shown = f"{number(shares[worst])} % of the range{output}"
+    text = f"{number(shares[worst])} % of the range{output}"
     if max_error is not None and not shares[worst] <= max_error:
-        large = f"The extended model's held-out error is {shown}; expected {max_error:g} % at most."
-    return [verdict, Case("held-out error", f"{shown} by the extended model", large)]
+        large = f"The extended model's held-out error is {text}; expected {max_error:g} % at most."
+    return [verdict, Case("held-out error", f"{text} by the extended model", large)]

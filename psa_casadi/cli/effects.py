@@ -40,21 +40,21 @@ def effects(
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page
 
-    given = Given(effects=effects)
-    listed = known_effects(given.own)
+    inputs = Given(effects=effects)
+    listed = known_effects(inputs.own)
     known = {**listed, **{e.name: e for e in MODAL_SERIES.values()}}
-    stack, size = given.model(model), None
+    stack, size = inputs.model(model), None
     wanted = (name or "").strip().lower().replace("-", "_").replace(" ", "_")
-    given.outputs({"--figure": figure}, [])
+    inputs.outputs({"--figure": figure}, [])
     if name is None and figure is not None:
-        given.add(
+        inputs.add(
             "--figure draws one effect and none is named; say which, as in"
             f" `psa effects {next(iter(known))} --figure {figure}`."
         )
     if name is not None and wanted not in known:
         meant = similar(wanted, known, f"there are {', '.join(known)}.")
-        given.add(f"There is no effect named '{name}'; {meant}")
-    given.check()
+        inputs.add(f"There is no effect named '{name}'; {meant}")
+    inputs.check()
     if name is None and quiet:
         show("\n".join(listed))
     elif name is None:

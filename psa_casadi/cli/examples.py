@@ -32,16 +32,16 @@ def examples(
     from psa_casadi.examples import index
     from psa_casadi.report.words.tables import Table
 
-    given, known = Given(), index.examples()
+    inputs, known = Given(), index.examples()
     if name is None and output is not None:
-        given.add("-o needs the name of an example or a recipe; `psa examples` lists them.")
+        inputs.add("-o needs the name of an example or a recipe; `psa examples` lists them.")
     if copy_only and output is None:
-        given.add("--copy-only needs a folder to copy to; name it with -o.")
+        inputs.add("--copy-only needs a folder to copy to; name it with -o.")
     wanted = (name or "").strip().lower().replace("-", "_").removesuffix(".py").removesuffix(".md")
     if name is not None and wanted not in known:
         meant = similar(wanted, known, "`psa examples` lists them.")
-        given.add(f"There is no example or recipe named '{name}'; {meant}")
-    given.check()
+        inputs.add(f"There is no example or recipe named '{name}'; {meant}")
+    inputs.check()
     if name is None and quiet:
         show("\n".join(known))
     elif name is None:
@@ -54,17 +54,17 @@ def examples(
     elif output is None:
         show(known[wanted].text.rstrip("\n"))
     else:
-        found = known[wanted]
+        matches = known[wanted]
         make_folder(output)
         before = {p.name for p in output.iterdir()}
-        written = index.copy_example(found, output)
+        written = index.copy_example(matches, output)
         result: object = None
-        if found.kind == "example" and not copy_only:
-            with working(f"running {found.name}", quiet):
-                result = index.run_example(found.name, output)
+        if matches.kind == "example" and not copy_only:
+            with working(f"running {matches.name}", quiet):
+                result = index.run_example(matches.name, output)
         if isinstance(result, Mapping):  # named figures, one in each line
-            shown = ((k, f"{v:.4g}" if isinstance(v, float) else v) for k, v in result.items())
-            result = "\n".join(f"{k}: {v}" for k, v in shown)
+            displayed = ((k, f"{v:.4g}" if isinstance(v, float) else v) for k, v in result.items())
+            result = "\n".join(f"{k}: {v}" for k, v in displayed)
         if isinstance(result, str):
             show(result, quiet)
         new = sorted(p for p in output.iterdir() if p.name not in before and p not in written)

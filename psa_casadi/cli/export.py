@@ -35,7 +35,7 @@ def c(
     include_sensor: bool = False,
     start: Start,
     published: Published,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost.
 
@@ -55,26 +55,28 @@ def c(
     Example:
         psa export c --stack P-885.51 --step 10us -o code
     """
-    seconds = given.attempt(lambda: step_seconds(step))
+    seconds = inputs.attempt(lambda: step_seconds(step))
     base = chosen = None
     if part is None or model or stack:
-        base = chosen = given.model_or_stack(model, stack, any_model=True)
+        base = chosen = inputs.model_or_stack(model, stack, any_model=True)
     if part is not None and seconds is not None and bool(model or stack) == (base is not None):
-        chosen = given.attempt(lambda: psa.part_for(part, base, period=seconds))
-    chosen = given.ready(given.published(given.started(chosen, start), published))
-    period = given.ready(seconds)
-    with working("generating", given.quiet) as progress:
+        chosen = inputs.attempt(lambda: psa.part_for(part, base, period=seconds))
+    chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
+    period = inputs.ready(seconds)
+    with working("generating", inputs.quiet) as progress:
         progress("compiling and comparing")
-        found = psa.export_c(
+        code_export = psa.export_c(
             chosen, output, step=period, precision=precision, name=name,
             include_sensor=include_sensor, hold=hold, substeps=substeps,
         )  # fmt: skip
-    _show_inside(chosen, include_sensor, given.quiet)
+    _show_inside(chosen, include_sensor, inputs.quiet)
     for note in chosen.provenance.notes if part else ():
-        show(note, given.quiet)
-    errors = {e.voltage: e.error for e in found.errors}
-    _show_step(f"{period:g} s", found.substeps, precision, errors, found.limit, given.quiet)
-    tell_written(found.header, found.source, quiet=given.quiet)
+        show(note, inputs.quiet)
+    errors = {e.voltage: e.error for e in code_export.errors}
+    _show_step(
+        f"{period:g} s", code_export.substeps, precision, errors, code_export.limit, inputs.quiet
+    )
+    tell_written(code_export.header, code_export.source, quiet=inputs.quiet)
 
 
 def _show_inside(model: "psa.Model", include_sensor: bool, quiet: bool) -> "psa.Model":
@@ -118,7 +120,7 @@ def fmu(
     validity_output: bool = False,
     start: Start,
     published: Published,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive.
 
@@ -144,55 +146,55 @@ def fmu(
     from psa_casadi.export.fmu.sources import FIXED_ENTRY
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
-    given.outputs({"--output": output}, [model])
+    inputs.outputs({"--output": output}, [model])
     if sets_to is not None and sets_to.exists() and not sets_to.is_dir():
-        given.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
+        inputs.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
-    targets = given.attempt(lambda: chosen_platforms(wanted))
+    targets = inputs.attempt(lambda: chosen_platforms(wanted))
     if (solver == "fixed") != (step is not None):
-        given.add("--solver fixed and --step belong together; give both or neither.")
+        inputs.add("--solver fixed and --step belong together; give both or neither.")
     seconds = (
-        given.attempt(lambda: step_seconds(step))
+        inputs.attempt(lambda: step_seconds(step))
         if step is not None and solver == "fixed"
         else None
     )
-    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.ready(given.published(given.started(chosen, start), published))
-    targets = given.ready(targets)
+    chosen = inputs.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
+    targets = inputs.ready(targets)
     if chosen.structure.foreign:
         psa.export_extended(chosen, output)
-        tell_written(output, quiet=given.quiet)
+        tell_written(output, quiet=inputs.quiet)
         return
-    with working("compiling", given.quiet) as progress:
+    with working("compiling", inputs.quiet) as progress:
         progress(", ".join(t.name for t in targets))
         psa.export_fmu(
             chosen, output, name=name, include_sensor=include_sensor, platforms=wanted,
             fmi=int(fmi), parameter_sets=parameter_sets, validity_output=validity_output,
             step=seconds,
         )  # fmt: skip
-    kept = _show_inside(chosen, include_sensor, given.quiet)
+    kept = _show_inside(chosen, include_sensor, inputs.quiet)
     sets = set_files(kept, parameter_sets)
     if sets_to is not None and sets:
         make_folder(sets_to)
         for place, text in sets.items():
             atomic_write(sets_to / place.rpartition("/")[2], text)
-    show(f"platforms: {', '.join(t.name for t in targets)}", given.quiet)
-    show(f"start: {_start_words(kept)}", given.quiet)
+    show(f"platforms: {', '.join(t.name for t in targets)}", inputs.quiet)
+    show(f"start: {_start_words(kept)}", inputs.quiet)
     if seconds is None:
-        show(f"evidence: {_evidence_words(kept, len(sets))}", given.quiet)
+        show(f"evidence: {_evidence_words(kept, len(sets))}", inputs.quiet)
     else:
         fixed = json.loads(zipfile.Path(output, FIXED_ENTRY).read_bytes())
         limit = fixed.get("voltage_limit", math.inf)
         _show_step(
-            f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit, given.quiet
+            f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit, inputs.quiet
         )
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
             f" `{INSTALL_ZIG}` it loads on older ones too.",
-            given.quiet,
+            inputs.quiet,
         )
-    tell_written(output, quiet=given.quiet)
+    tell_written(output, quiet=inputs.quiet)
 
 
 def _evidence_words(model: "psa.Model", sets: int) -> str:
@@ -227,7 +229,7 @@ def modelica(
     include_sensor: bool = False,
     start: Start,
     published: Published,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Write a model as a Modelica package: signals, connectors, examples in one file.
 
@@ -240,13 +242,13 @@ def modelica(
     """
     from psa_casadi.export.modelica.package import class_names
 
-    given.outputs({"--output": output}, [model])
-    chosen = given.model_or_stack(model, stack, part=part, any_model=True)
-    chosen = given.ready(given.published(given.started(chosen, start), published))
+    inputs.outputs({"--output": output}, [model])
+    chosen = inputs.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
-    kept = _show_inside(chosen, include_sensor, given.quiet)
-    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", given.quiet)
-    tell_written(output, quiet=given.quiet)
+    kept = _show_inside(chosen, include_sensor, inputs.quiet)
+    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", inputs.quiet)
+    tell_written(output, quiet=inputs.quiet)
 
 
 def ssp(
@@ -260,7 +262,7 @@ def ssp(
     picture: Path | None = None,
     platforms: str = "host",
     published: Published,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired.
 
@@ -279,40 +281,40 @@ def ssp(
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.export.ssp import OUTSIDE, Port, layout_of, save_wiring, stable_step, wiring_of
 
-    given.outputs({"--output": output, "--picture": picture}, [model])
+    inputs.outputs({"--output": output, "--picture": picture}, [model])
     if picture is not None and picture.suffix.lower() not in (".svg", ".png"):
-        given.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
+        inputs.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
-    given.attempt(lambda: chosen_platforms(wanted))
-    found = own_model(given, model, Fitting())
-    if found is not None and found.structure.foreign:
-        given.refuse({"--picture": picture, "--stack": stack, "--no-compensator": no_compensator})
-        given.check()
-        psa.export_extended(found, output, platforms=wanted)
-        tell_written(output, quiet=given.quiet)
+    inputs.attempt(lambda: chosen_platforms(wanted))
+    result = own_model(inputs, model, Fitting())
+    if result is not None and result.structure.foreign:
+        inputs.refuse({"--picture": picture, "--stack": stack, "--no-compensator": no_compensator})
+        inputs.check()
+        psa.export_extended(result, output, platforms=wanted)
+        tell_written(output, quiet=inputs.quiet)
         return
-    chosen = given.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
-    chosen = given.published(chosen, published)
+    chosen = inputs.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
+    chosen = inputs.published(chosen, published)
     system = None
     if chosen is not None:
         made = partial(psa.nanopositioner, chosen, compensated=not no_compensator)
-        system = given.attempt(made)
-    chosen, system = given.ready(chosen), given.ready(system)
-    with working("compiling", given.quiet) as progress:
+        system = inputs.attempt(made)
+    chosen, system = inputs.ready(chosen), inputs.ready(system)
+    with working("compiling", inputs.quiet) as progress:
         progress(", ".join(system.parts))
         psa.export_ssp(system, output, platforms=wanted, publication=chosen.publication)
     wiring = wiring_of(system)
     if picture is not None:
         save_wiring(wiring, layout_of(wiring), picture)
-    show(f"parts: {', '.join(system.parts)}", given.quiet)
+    show(f"parts: {', '.join(system.parts)}", inputs.quiet)
     for kind in ("input", "output"):
-        ports = [n for n, found in wiring.ports(OUTSIDE) if found == kind]
+        ports = [n for n, result in wiring.ports(OUTSIDE) if result == kind]
         named = (f"{n} [{wiring.unit(Port(OUTSIDE, n))}]" for n in ports)
-        show(f"{kind}s: {', '.join(named)}", given.quiet)
-    if not given.quiet:
+        show(f"{kind}s: {', '.join(named)}", inputs.quiet)
+    if not inputs.quiet:
         held, sloped = (1e6 * stable_step(wiring, rates=rates) for rates in (False, True))
         show(
             f"communication step: unstable above {held:.3g} us with inputs held over a step, above"
             f" {sloped:.3g} us with input derivatives"
         )
-    tell_written(output, picture, quiet=given.quiet)
+    tell_written(output, picture, quiet=inputs.quiet)

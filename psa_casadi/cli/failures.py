@@ -87,10 +87,10 @@ def kept(
 ) -> str:
     """Say what an interrupt has cut off, which files there are, and which were not written."""
     there, absent = (", ".join(str(p) for p in ps if p is not None) for ps in (files, missing))
-    told = (
+    text = (
         f"{what}. Kept: {there}{mark}." if there else f"{what}; no -o names a file to keep it in."
     )
-    return f"{told} Not written: {absent}." if absent else told
+    return f"{text} Not written: {absent}." if absent else text
 
 
 def leave() -> NoReturn:
@@ -150,23 +150,23 @@ def prepare() -> None:
 
 def _refused_by_the_machine(error: Exception) -> str | None:
     """Return what the machine refused and what to do; None where the error is not of this kind."""
-    said = str(error)
-    if isinstance(error, MemoryError) or any(word in said for word in _MEMORY):
+    statement = str(error)
+    if isinstance(error, MemoryError) or any(word in statement for word in _MEMORY):
         return (
             "there is too little memory; close other programs, raise the limit (ulimit -v), or give"
             " fewer or shorter records."
         )
-    if isinstance(error, OSError) and "No usable temporary directory" in said:
+    if isinstance(error, OSError) and "No usable temporary directory" in statement:
         return "there is no folder for temporary files; set TMPDIR to one that may be written to."
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         what, cure = _REFUSALS[error.errno]
         where = f" ({error.filename})" if error.filename else ""
         return f"{what}{where}; {cure}."
-    if isinstance(error, RuntimeError) and "can't start new thread" in said:
+    if isinstance(error, RuntimeError) and "can't start new thread" in statement:
         return "no more threads may be started; close other programs, or raise the limit."
     if isinstance(error, ImportError) and not (error.name or "").startswith("psa_casadi"):
         return (
-            f"the installation is not complete ({said}); install psa_casadi again with what it"
+            f"the installation is not complete ({statement}); install psa_casadi again with what it"
             " needs."
         )
     return None
@@ -205,8 +205,8 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(1) from error
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
-            told = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
-            tell(f"Interrupted: {told}")
+            output = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
+            tell(f"Interrupted: {output}")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             if os.environ.get(DEBUG):

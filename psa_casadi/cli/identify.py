@@ -34,7 +34,7 @@ def identify(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine.
 
@@ -59,48 +59,48 @@ def identify(
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
-    own = own_model(given, model, fitting)
+    item = own_model(inputs, model, fitting)
     outputs = {"--output": output, "--json": json, "--report": report}
-    given.outputs(outputs, [*records, model, fitting.fmu])
-    if own is not None:
+    inputs.outputs(outputs, [*records, model, fitting.fmu])
+    if item is not None:
         of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
-        given.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
-        signals = given.signals(own, records, reading)
+        inputs.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
+        signals = inputs.signals(item, records, reading)
         work: Callable[..., psa.Identification] = partial(
-            psa.identify, own, signals, **fitting.words
+            psa.identify, item, signals, **fitting.words
         )
     else:
-        given.stiffness(stiffness)
-        measured = given.records(records, reading)
-        start = given.model_or_stack(model, stack, needed=False)
+        inputs.stiffness(stiffness)
+        measured = inputs.records(records, reading)
+        start = inputs.model_or_stack(model, stack, needed=False)
         if method == "paper":
-            _refuse_beside_paper(given, (model, stack), hysteresis, profile)
+            _refuse_beside_paper(inputs, (model, stack), hysteresis, profile)
             work = partial(identify_by_paper, measured, stiffness=stiffness)
         else:
             work = partial(
                 of_stack, measured, model=start, stiffness=stiffness, hysteresis=hysteresis
             )
-    given.check()
-    with working("identifying", given.quiet, IDENTIFY) as progress:
-        found = work(progress=progress)
-        profiles = _finish(found, outputs, profile or (), (origin, still), progress)
-    text = repr(found)
-    if isinstance(found, StackIdentification):
-        text = identification_text(found, origin=origin, width=width())
-    show(text, given.quiet)
+    inputs.check()
+    with working("identifying", inputs.quiet, IDENTIFY) as progress:
+        result = work(progress=progress)
+        profiles = _finish(result, outputs, profile or (), (origin, still), progress)
+    text = repr(result)
+    if isinstance(result, StackIdentification):
+        text = identification_text(result, origin=origin, width=width())
+    show(text, inputs.quiet)
     for found_profile in profiles:
-        show("\n" + "\n".join(profile_sentences(found_profile)), given.quiet)
-    if left_out := [n for n in profile or () if n not in found.determinacy.names]:
+        show("\n" + "\n".join(profile_sentences(found_profile)), inputs.quiet)
+    if left_out := [n for n in profile or () if n not in result.determinacy.names]:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
-            f" searched are {', '.join(found.determinacy.names)}.",
-            given.quiet,
+            f" searched are {', '.join(result.determinacy.names)}.",
+            inputs.quiet,
         )
-    tell_written(*outputs.values(), quiet=given.quiet)
+    tell_written(*outputs.values(), quiet=inputs.quiet)
 
 
 def _refuse_beside_paper(
-    given: Given, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
+    inputs: Given, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
 ) -> None:
     """Note the options that the paper's method does not take."""
     for wrong, sentence in (
@@ -112,7 +112,7 @@ def _refuse_beside_paper(
         ),
     ):
         if wrong:
-            given.add(f"--method paper {sentence}")
+            inputs.add(f"--method paper {sentence}")
 
 
 def _save(model: psa.Model, output: Path) -> None:
@@ -120,12 +120,12 @@ def _save(model: psa.Model, output: Path) -> None:
     if output.suffix.lower() not in (".fmu", ".ssv"):
         psa.save_model(model, output)
         return
-    for said in psa.save_start_values(model, output):
-        tell(f"Note: {said}")
+    for statement in psa.save_start_values(model, output):
+        tell(f"Note: {statement}")
 
 
 def _finish(
-    found: "psa.Identification",
+    identification: "psa.Identification",
     outputs: dict[str, Path | None],
     wanted: Sequence[str],
     page: tuple[str, bool],
@@ -143,25 +143,34 @@ def _finish(
     done: list[Path] = []
     try:
         if output is not None:
-            _save(found.model, output)
+            _save(identification.model, output)
             done.append(output)
-        names = [n for n in wanted if n in found.determinacy.names and not found.interrupted]
-        profiles = [profile(found.fit, found.experiments, n, progress=progress) for n in names]
+        names = [
+            n
+            for n in wanted
+            if n in identification.determinacy.names and not identification.interrupted
+        ]
+        profiles = [
+            profile(identification.fit, identification.experiments, n, progress=progress)
+            for n in names
+        ]
         if json is not None:
-            atomic_write(json, json_text(identification_file(found, profiles)))
+            atomic_write(json, json_text(identification_file(identification, profiles)))
             done.append(json)
-        if report is not None and not found.interrupted:
+        if report is not None and not identification.interrupted:
             progress("writing the report")
-            psa.write_fit_report(found, report, origin=page[0], profiles=profiles, still=page[1])
-        ended = found.interrupted
+            psa.write_fit_report(
+                identification, report, origin=page[0], profiles=profiles, still=page[1]
+            )
+        ended = identification.interrupted
     except KeyboardInterrupt:
         if output is not None and output not in done:
-            _save(found.model, output)
+            _save(identification.model, output)
             done.append(output)
         ended = True
     if not ended:
         return profiles
-    cut = found.fit.interrupted
+    cut = identification.fit.interrupted
     what = "the search was cut off" if cut else "the fit was finished before"
     missing = [p for p in outputs.values() if p not in done]
     raise KeyboardInterrupt(kept(what, done, missing, " (marked as interrupted)" if cut else ""))

@@ -45,7 +45,7 @@ class Given:
         from psa_casadi.model.own_effects import declared_effects, misfits
 
         read = [self.attempt(partial(declared_effects, module)) for module in self.effects]
-        self.own = [c for found in read for c in (found or {}).values()]
+        self.own = [c for result in read for c in (result or {}).values()]
         self._misfits = misfits(self.own)
 
     def of_any_model(self) -> list[psa.Component]:
@@ -86,25 +86,25 @@ class Given:
         wanted = self.columns(reading.columns, [*paths, *held_out])
         if wanted is None:
             return []
-        found: list[psa.Record] = []
+        records: list[psa.Record] = []
         for files, fitted in ((paths, True), (held_out, False)):
             read = partial(
                 psa.read_records, files, need_excitation=fitted, columns=wanted,
                 sample_time=reading.sample_time,
             )  # fmt: skip
             for record in (self.attempt(read) if files else None) or ():
-                twin = next((r for r in found if r.sha256 == record.sha256), None)
+                twin = next((r for r in records if r.sha256 == record.sha256), None)
                 if twin is not None:
                     self.add(
                         f"{record.source}: holds the same data as {twin.source}; a record counts"
                         " once, and one that is held out cannot be fitted too: remove one of the"
                         " two."
                     )
-                found.append(record)
+                records.append(record)
                 self.fitted += fitted
                 for note in () if self.quiet else record.notes:
                     tell(f"Note: {note}")
-        return found
+        return records
 
     def signals(
         self, model: "psa.Model", paths: Sequence[Path], reading: Reading
@@ -112,7 +112,7 @@ class Given:
         """Read records of a model of one's own, each in the units of its file."""
         if not paths:
             return ()
-        found = self.attempt(
+        result = self.attempt(
             lambda: psa.read_signals(
                 paths, inputs=model.input_names, outputs=model.output_names,
                 columns=reading.columns, sample_time=reading.sample_time,
@@ -121,9 +121,9 @@ class Given:
         lacks = [f"column '{n}' is missing" for n in model.input_names]
         if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")
-        for note in [n for s in found or () for n in s.notes if not self.quiet]:
+        for note in [n for s in result or () for n in s.notes if not self.quiet]:
             tell(f"Note: {note}")
-        return found or ()
+        return result or ()
 
     def refuse(self, others: Mapping[str, object]) -> None:
         """Refuse the options that a model of one's own does not take, of those that are given."""
@@ -132,14 +132,14 @@ class Given:
 
     def numbers(self, option: str, texts: Sequence[str] | None) -> dict[str, float]:
         """Return the numbers of an option NAME=VALUE that may be repeated."""
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         for text in texts or ():
             name, _, figure = text.partition("=")
             try:
-                found[name.strip()] = float(figure)
+                values[name.strip()] = float(figure)
             except ValueError:
                 self.add(f"{option} is '{text}'; give NAME=VALUE, such as {option} mass=0.3.")
-        return found
+        return values
 
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
         """Return what --columns says, nothing where it is left out; None where it is wrong.
@@ -148,11 +148,11 @@ class Given:
         """
         from psa_casadi.records.read.columns import files_named, parse_columns
 
-        found = self.attempt(lambda: parse_columns(text)) if text is not None else {}
-        named = files_named(found or {}) if paths is not None else set()
+        column_map = self.attempt(lambda: parse_columns(text)) if text is not None else {}
+        named = files_named(column_map or {}) if paths is not None else set()
         for name in sorted(named - {p.name for p in paths or ()}):
             self.add(f"--columns: '{name}' is none of the files; give its name without a folder.")
-        return found
+        return column_map
 
     def model(self, path: Path | None) -> "psa.Model | None":
         """Read a stack's model; None where no file is named."""
@@ -186,10 +186,10 @@ class Given:
         With `any_model` the file need not hold a stack.
         """
         options = {"--model": path, "--stack": stack, "--part": part}
-        given = [name for name, value in options.items() if value is not None]
-        if len(given) > 1:
-            all_of_them = "both" if len(given) == 2 else "all"
-            self.add(f"{' and '.join(given)} are {all_of_them} given; leave one of them out.")
+        items = [name for name, value in options.items() if value is not None]
+        if len(items) > 1:
+            all_of_them = "both" if len(items) == 2 else "all"
+            self.add(f"{' and '.join(items)} are {all_of_them} given; leave one of them out.")
             return None
         if part is not None:
             return self.attempt(lambda: psa.part_model(part))
@@ -226,15 +226,15 @@ class Given:
             lambda: psa.settled_at(model, voltage, turns, sweep=start.sweep, rest=start.rest)
         )
 
-    def published(self, model: "psa.Model | None", said: Published) -> "psa.Model | None":
+    def published(self, model: "psa.Model | None", published: Published) -> "psa.Model | None":
         """Return a model that states what the options say, else what it stated before."""
-        given = {name: text for name, text in asdict(said).items() if text is not None}
-        for name, text in given.items():
+        table = {name: text for name, text in asdict(published).items() if text is not None}
+        for name, text in table.items():
             if not text.strip() or not text.isprintable():
                 self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
         if model is None:
             return None
-        return replace(model, publication=replace(model.publication, **given))
+        return replace(model, publication=replace(model.publication, **table))
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""
@@ -299,15 +299,15 @@ def step_seconds(text: str) -> float:
     """
     from psa_casadi.units import parse_unit, to_si, units_of
 
-    found = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    result = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
     try:
-        number = float(found["number"]) if found else 0.0
+        number = float(result["number"]) if result else 0.0
     except ValueError:
-        found = None
-    if found and not found["unit"].strip():
-        meant = " or ".join(f"{found['number']}{unit}" for unit in ("s", "ms", "us"))
+        result = None
+    if result and not result["unit"].strip():
+        meant = " or ".join(f"{result['number']}{unit}" for unit in ("s", "ms", "us"))
         raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
-    unit = parse_unit(found["unit"], "time").name if found else ""
+    unit = parse_unit(result["unit"], "time").name if result else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))

@@ -24,7 +24,7 @@ def linearize(
     observer: Path | None = None,
     noise: list[str] | None = None,
     step: float = 1e-4,
-    given: Given,
+    arguments: Given,
 ) -> None:
     """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
 
@@ -51,41 +51,45 @@ def linearize(
     """
     from psa_casadi.report.plots.figures import save_bode
 
-    given.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
-    chosen = own_model(given, model, Fitting(fmu=fmu), fitted=False)
+    arguments.outputs(
+        {"--output": output, "--figure": figure, "--observer": observer}, [model, fmu]
+    )
+    chosen = own_model(arguments, model, Fitting(fmu=fmu), fitted=False)
     if chosen is None:
-        chosen = given.model_or_stack(model, stack, any_model=True)
-    inputs, states = given.numbers("--at", at), given.numbers("--state", state)
-    sizes, loop = given.numbers("--noise", noise), _parsed(given, controller)
-    given.check()
-    found = psa.linearize(given.ready(chosen), inputs, states=states)
-    show(repr(found), given.quiet)
+        chosen = arguments.model_or_stack(model, stack, any_model=True)
+    inputs, states = arguments.numbers("--at", at), arguments.numbers("--state", state)
+    sizes, loop = arguments.numbers("--noise", noise), _parsed(arguments, controller)
+    arguments.check()
+    result = psa.linearize(arguments.ready(chosen), inputs, states=states)
+    show(repr(result), arguments.quiet)
     if loop is not None:
-        told = psa.margins(found, loop, input=from_, output=to)
-        ends = "stable" if told["stable"] else "NOT STABLE"
+        m = psa.margins(result, loop, input=from_, output=to)
+        ends = "stable" if m["stable"] else "NOT STABLE"
         show(
-            f"loop: gain margin {told['gain_margin']:.4g} at {told['gain_margin_at']:.4g} Hz, phase"
-            f" margin {told['phase_margin']:.4g} degrees at {told['phase_margin_at']:.4g} Hz, delay"
-            f" margin {told['delay_margin']:.4g} s; the closed loop is {ends}",
-            given.quiet,
+            f"loop: gain margin {m['gain_margin']:.4g} at {m['gain_margin_at']:.4g} Hz, phase"
+            f" margin {m['phase_margin']:.4g} degrees at {m['phase_margin_at']:.4g} Hz, delay"
+            f" margin {m['delay_margin']:.4g} s; the closed loop is {ends}",
+            arguments.quiet,
         )
     if output is not None:
-        found.save(output)
+        result.save(output)
     if figure is not None:
-        save_bode(found, figure)
+        save_bode(result, figure)
     if observer is not None:
         made = psa.observer(
-            found, input_noise={n: v for n, v in sizes.items() if n in found.input_names},
-            output_noise={n: v for n, v in sizes.items() if n not in found.input_names}, step=step,
-        )  # fmt: skip
+            result,
+            input_noise={n: v for n, v in sizes.items() if n in result.input_names},
+            output_noise={n: v for n, v in sizes.items() if n not in result.input_names},
+            step=step,
+        )
         if observer.suffix.lower() == ".fmu":
             psa.export_fmu(made, observer)
         else:
             psa.export_c(made, observer, step=step)
-    tell_written(output, figure, observer, quiet=given.quiet)
+    tell_written(output, figure, observer, quiet=arguments.quiet)
 
 
-def _parsed(given: Given, controller: str | None) -> tuple[list[float], list[float]] | None:
+def _parsed(inputs: Given, controller: str | None) -> tuple[list[float], list[float]] | None:
     """Return numerator and denominator of a controller's text; None without one."""
     if controller is None:
         return None
@@ -96,5 +100,5 @@ def _parsed(given: Given, controller: str | None) -> tuple[list[float], list[flo
             return top, bottom
     except ValueError:
         pass
-    given.add(f"--controller is '{controller}'; give coefficients, as \"2 50 / 1 0\".")
+    inputs.add(f"--controller is '{controller}'; give coefficients, as \"2 50 / 1 0\".")
     return None

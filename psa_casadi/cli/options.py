@@ -48,8 +48,8 @@ _ENTRY = re.compile(r"^    (\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as typer takes it, with its errors told in sentences."""
-    about, own = _described(function)
-    helps = {**_SHARED, **own}
+    about, item = _described(function)
+    helps = {**_SHARED, **item}
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, tuple[str, ...]]] = {}
     for p in inspect.signature(function).parameters.values():
@@ -57,15 +57,15 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             group: Any = p.annotation
             fields = inspect.signature(group).parameters
             groups[p.name] = group, tuple(fields)
-            told = {**_SHARED, **_described(group)[1], **own}
-            parameters += [_declared(q, told) for q in fields.values()]
+            table = {**_SHARED, **_described(group)[1], **item}
+            parameters += [_declared(q, table) for q in fields.values()]
         else:
             parameters.append(_declared(p, helps))
 
-    def run(**given: Any) -> None:
+    def run(**options: Any) -> None:
         for name, (group, fields) in groups.items():
-            given[name] = group(**{q: given.pop(q) for q in fields})
-        function(**given)
+            options[name] = group(**{q: options.pop(q) for q in fields})
+        function(**options)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__doc__, run.__name__ = about, function.__name__
@@ -118,8 +118,8 @@ def names(kind: str) -> Callable[[str], list[str]]:
         module, name = _KNOWN[kind]
         known = getattr(import_module(module), name)
         before, comma, word = incomplete.rpartition(",")
-        begun = (k for k in (known() if callable(known) else known) if k.startswith(word))
-        return [f"{before}{comma}{k}" for k in begun]
+        started = (k for k in (known() if callable(known) else known) if k.startswith(word))
+        return [f"{before}{comma}{k}" for k in started]
 
     return complete
 

@@ -51,7 +51,7 @@ class Fitting:
 
 
 def own_model(
-    given: Given, path: Path | None, fitting: Fitting, *, fitted: bool = True
+    inputs: Given, path: Path | None, fitting: Fitting, *, fitted: bool = True
 ) -> psa.Model | None:
     """Return the model that a path names where it is no stack's; None for a stack's or none.
 
@@ -60,37 +60,37 @@ def own_model(
     A model that cannot be made ends the command.
     """
     if fitting.fmu is not None and path is not None:
-        given.add("--fmu and --model are both given; leave one of them out.")
-    found = (
-        None if (place := fitting.fmu or path) is None else _model(given, place, fitting, fitted)
+        inputs.add("--fmu and --model are both given; leave one of them out.")
+    model = (
+        None if (place := fitting.fmu or path) is None else _model(inputs, place, fitting, fitted)
     )
-    if found is None or not found.structure.foreign:
+    if model is None or not model.structure.foreign:
         bounds = [text for text in fitting.free or () if "=" in text]
         for text in [*bounds, *(fitting.value or ())]:
-            given.add(f"'{text}' is said of an FMU; add --fmu FILE.fmu.")
-    if found is None:
+            inputs.add(f"'{text}' is said of an FMU; add --fmu FILE.fmu.")
+    if model is None:
         for name in fitting.words:
             option = name.replace("_", "-")
-            given.add(f"--{option} is said of a model of your own; add --model FILE.py:FUNCTION.")
-    return found
+            inputs.add(f"--{option} is said of a model of your own; add --model FILE.py:FUNCTION.")
+    return model
 
 
-def _model(given: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _model(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
     match = _PYTHON.fullmatch(str(path))
     if match is not None:
         return _made(Path(match["file"]), match["name"] or "")
     if path.suffix.lower() == ".fmu" or fitting.fmu:
-        return _imported(given, path, fitting, fitted)
+        return _imported(inputs, path, fitting, fitted)
     try:
-        model = psa.load_model(path, given.own)
+        model = psa.load_model(path, inputs.own)
     except InputError:  # which is told where a stack's file is read
         return None
     return None if is_stack(model) else model
 
 
-def _imported(given: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _imported(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
     free: dict[str, tuple[float, float] | None] = {}
     for text in fitting.free or ():
@@ -99,9 +99,9 @@ def _imported(given: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.M
         try:
             free[name.strip()] = (float(low), float(high)) if equals else None
         except ValueError:
-            given.add(f"--free is '{text}'; give NAME=LOW:HIGH, such as --free mass=0.1:10.")
-    values = given.numbers("--value", fitting.value)
-    given.check()
+            inputs.add(f"--free is '{text}'; give NAME=LOW:HIGH, such as --free mass=0.1:10.")
+    values = inputs.numbers("--value", fitting.value)
+    inputs.check()
     return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
 
 
@@ -119,12 +119,12 @@ def _made(file: Path, name: str) -> psa.Model:
             f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
         ) from error
     if not isinstance(model, psa.Model):
-        own = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
-        there = f"; it has {quoted(own)}" if own else ""
+        items = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        there = f"; it has {quoted(items)}" if items else ""
         lacks = f"{file} has no function '{name}' that returns a model{there}. Name one that does"
         if not name:
             lacks = f"say which function of {file} returns the model{there}"
-        raise InputError(f"--model: {lacks}, as {file}:{own[-1] if own else 'make'}.")
+        raise InputError(f"--model: {lacks}, as {file}:{items[-1] if items else 'make'}.")
     return model
 
 
@@ -134,7 +134,7 @@ def own_diagnosis(
     held_out: Sequence[Path],
     fitting: Fitting,
     reading: Reading,
-    given: Given,
+    inputs: Given,
     *,
     leave_out: Sequence[str],
     others: Mapping[str, object],
@@ -143,10 +143,10 @@ def own_diagnosis(
 
     That takes `progress` and `watch`; `others` are options that must be empty.
     """
-    own = given.of_any_model()
-    given.refuse(others)
-    measured, held = (given.signals(model, part, reading) for part in (records, held_out))
+    components = inputs.of_any_model()
+    inputs.refuse(others)
+    measured, held = (inputs.signals(model, part, reading) for part in (records, held_out))
     return partial(
-        psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=own,
+        psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=components,
         **fitting.words,
     )  # fmt: skip

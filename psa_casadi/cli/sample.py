@@ -32,7 +32,7 @@ def sample(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Draw the parameters of a model from their posterior, given records (extra sample).
 
@@ -65,37 +65,37 @@ def sample(
     if (model, stack) == (None, None) and len(records) > 1 and records[0].suffix == ".json":
         model, *records = records  # as it was written before there was --model here
     files = {"--output": output, "--json": json, "--figure": figure, "--report": report}
-    given.outputs(files, [model, *records])
-    centres, widths = _priors(given, prior or ())
-    start = own_model(given, model, fitting if fitting.fmu else replace(fitting, free=None))
+    inputs.outputs(files, [model, *records])
+    centres, widths = _priors(inputs, prior or ())
+    start = own_model(inputs, model, fitting if fitting.fmu else replace(fitting, free=None))
     measured: Sequence[psa.Record | psa.Signals]
     if start is not None:
-        given.refuse({"--stack": stack})
-        measured = given.signals(start, records, reading)
+        inputs.refuse({"--stack": stack})
+        measured = inputs.signals(start, records, reading)
     else:
-        measured = given.records(records, reading)
-        start = given.model_or_stack(model, stack)
-    start = given.ready(start)
-    with working("sampling", given.quiet) as progress:
-        found = psa.sample(
+        measured = inputs.records(records, reading)
+        start = inputs.model_or_stack(model, stack)
+    start = inputs.ready(start)
+    with working("sampling", inputs.quiet) as progress:
+        result = psa.sample(
             start, measured, prior=centres, widths=widths, chains=chains, draws=draws, tune=tune,
             seed=seed, progress=progress, **fitting.words,
         )  # fmt: skip
         if output is not None:
             progress("writing the draws")
-            found.save(output)
+            result.save(output)
         if json is not None:
-            atomic_write(json, json_text(posterior_file(found)))
+            atomic_write(json, json_text(posterior_file(result)))
         if figure is not None:
             with atomic_path(figure) as temporary:
-                posterior_figure(found).savefig(temporary, format=picture_format(figure), dpi=DPI)
+                posterior_figure(result).savefig(temporary, format=picture_format(figure), dpi=DPI)
         if report is not None:
-            psa.report(found, report)
-    show(posterior_text(found, origin=origin, width=width()), given.quiet)
-    tell_written(*files.values(), quiet=given.quiet)
+            psa.report(result, report)
+    show(posterior_text(result, origin=origin, width=width()), inputs.quiet)
+    tell_written(*files.values(), quiet=inputs.quiet)
 
 
-def _priors(given: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+def _priors(inputs: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
     """Return centres and widths by the names of the parameters."""
     centres: dict[str, float] = {}
     widths: dict[str, float] = {}
@@ -105,5 +105,5 @@ def _priors(given: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[
         try:
             centres[name], widths[name] = float(centre), float(spread)
         except ValueError:
-            given.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
+            inputs.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
     return centres, widths

@@ -33,18 +33,18 @@ def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable
 
     Both tell the time so far, and the step of how many where the `course` of the work is known.
     """
-    told = Told(what, course)
+    output = Told(what, course)
     if quiet:
         yield lambda step: None
     elif sys.stderr.isatty():
-        with Console(stderr=True).status(told):
-            yield told.tell
+        with Console(stderr=True).status(output):
+            yield output.tell
     else:
-        tell(told.first())
+        tell(output.first())
 
         def next_step(step: str) -> None:
-            told.tell(step)
-            tell(f"  {told.line(drawn=False)}")
+            output.tell(step)
+            tell(f"  {output.line(drawn=False)}")
 
         yield next_step
 

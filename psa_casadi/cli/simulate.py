@@ -30,7 +30,7 @@ def simulate(
     figure: Path | None = None,
     reading: Reading,
     begin: Start,
-    given: Given,
+    arguments: Given,
 ) -> None:
     """Simulate a model on measured or planned inputs; write every output with its unit.
 
@@ -58,43 +58,45 @@ def simulate(
     from psa_casadi.files import atomic_path
     from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
 
-    given.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
+    arguments.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
     chosen_by = Fitting(fmu=fmu, value=value if imported else None)
-    own = partial(own_model, given, model, chosen_by, fitted=False)
-    chosen, record = _read(given, own, model, stack, input_, begin, reading)
-    turns = given.turns(begin.history)
-    values = {} if imported else given.numbers("--value", value)
-    starts = given.numbers("--start", start)
+    item = partial(own_model, arguments, model, chosen_by, fitted=False)
+    chosen, record = _read(arguments, item, model, stack, input_, begin, reading)
+    turns = arguments.turns(begin.history)
+    values = {} if imported else arguments.numbers("--value", value)
+    starts = arguments.numbers("--start", start)
     if chosen is not None:
-        chosen = given.attempt(partial(_begun, chosen, values, starts))
-    chosen, record = given.ready(chosen), given.ready(record)
-    with working("simulating", given.quiet):
+        chosen = arguments.attempt(partial(_begun, chosen, values, starts))
+    chosen, record = arguments.ready(chosen), arguments.ready(record)
+    with working("simulating", arguments.quiet):
         inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):
-            outputs, told = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
+            outputs, report = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
         else:
             u = np.column_stack([np.empty((record.n, 0)), *inputs.values()])
             x0 = np.array([q.start for q in chosen.structure.states])
             y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
             outputs = dict(zip(chosen.output_names, y.T, strict=True))
-            told = _start_values(chosen, starts), ""
-        shown = _as_displayed(chosen, record.time, {**inputs, **outputs})
-        written = with_units({"time": record.time, **shown.columns}, {"time": "s", **shown.units})
+            report = _start_values(chosen, starts), ""
+        signals = _as_displayed(chosen, record.time, {**inputs, **outputs})
+        written = with_units(
+            {"time": record.time, **signals.columns}, {"time": "s", **signals.units}
+        )
         psa.write_record(output, written)
         if figure is not None:
             with atomic_path(figure) as temporary:
-                drawn = columns_figure(shown, [n for n in chosen.output_names if n in outputs])
+                drawn = columns_figure(signals, [n for n in chosen.output_names if n in outputs])
                 drawn.savefig(temporary, format=picture_format(figure), dpi=DPI)
-    begins, took = told
-    show(f"start: {begins}", given.quiet)
-    show(f"{record.n} samples over {record.duration:.6g} s{took}", given.quiet)
-    show(f"columns: {', '.join(written)}", given.quiet)
-    tell_written(output, figure, quiet=given.quiet)
+    begin_times, took = report
+    show(f"start: {begin_times}", arguments.quiet)
+    show(f"{record.n} samples over {record.duration:.6g} s{took}", arguments.quiet)
+    show(f"columns: {', '.join(written)}", arguments.quiet)
+    tell_written(output, figure, quiet=arguments.quiet)
 
 
 def _read(
-    given: Given,
+    inputs: Given,
     own_or_none: "Callable[[], psa.Model | None]",
     model: Path | None,
     stack: str | None,
@@ -107,24 +109,24 @@ def _read(
 
     chosen = own_or_none()
     if chosen is not None:
-        own, problems = chosen, Problems()
+        item, problems = chosen, Problems()
         voltage = begin.start_voltage is not None
-        given.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
-        read = next(iter(given.signals(own, [input_], reading)), None)
-        signals = read and in_units(own, read, problems)
+        inputs.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
+        read = next(iter(inputs.signals(item, [input_], reading)), None)
+        signals = read and in_units(item, read, problems)
         for sentence in problems.sentences():
-            given.add(sentence)
-        return own, signals
-    chosen = given.model_or_stack(model, stack)
-    columns = given.columns(reading.columns, [input_])
+            inputs.add(sentence)
+        return item, signals
+    chosen = inputs.model_or_stack(model, stack)
+    columns = inputs.columns(reading.columns, [input_])
     record = None
     if columns is not None:
-        record = given.attempt(
+        record = inputs.attempt(
             lambda: psa.read_record(
                 input_, need_displacement=False, columns=columns, sample_time=reading.sample_time
             )
         )
-    return (chosen if begin.start_voltage is None else given.started(chosen, begin)), record
+    return (chosen if begin.start_voltage is None else inputs.started(chosen, begin)), record
 
 
 def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
@@ -140,8 +142,8 @@ def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
 
     every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
     units = {v.name: v.unit for v in every}
-    given = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
-    others = f", but for {', '.join(given)}" if given else ""
+    items = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
+    others = f", but for {', '.join(items)}" if items else ""
     return f"the start values of the model{others}"
 
 
@@ -159,12 +161,12 @@ def _of_a_stack(
     first, memory = float(record.voltage[0]), None
     if begin.history is not None and not as_exported:
         memory = psa.memory_after(model, turns, at=first, sweep=begin.sweep, rest=begin.rest)
-    found = psa.simulate(
+    result = psa.simulate(
         model, record.time, memory=memory, as_exported=as_exported, hold=hold, **inputs
     )
     values = _start_values(model, starts) if as_exported else ""
-    begins = start_sentence(model, record, begin.history, values)
-    return dict(found.outputs), (begins, f" in {found.steps} steps")
+    text = start_sentence(model, record, begin.history, values)
+    return dict(result.outputs), (text, f" in {result.steps} steps")
 
 
 def _as_displayed(
@@ -174,8 +176,8 @@ def _as_displayed(
     every: list[psa.Input | psa.Output] = [*model.structure.inputs, *model.structure.outputs]
     there = [v for v in every if v.name in columns]
     units = {v.name: v.display_unit or v.unit for v in there}
-    shown = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
-    return psa.Signals(name=model.name, time=time, columns=shown, units=units)
+    table = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
+    return psa.Signals(name=model.name, time=time, columns=table, units=units)
 
 
 def start_sentence(
@@ -196,10 +198,10 @@ def start_sentence(
     rate = initial_slope(record.time, record.voltage)
     moving = f", moving at {rate:.4g} V/s" if rate else ""
     option = f"--start-voltage {first:.4g}" + ("" if history is None else f" --history {history}")
-    begins = f"an FMU of it begins at rest there with {option}"
+    text = f"an FMU of it begins at rest there with {option}"
     if history is None and first:
-        begins = (
+        text = (
             f"an FMU with {option} has risen there from 0 V, which its hysteresis remembers:"
             f" give {option} here too to begin as it does"
         )
-    return f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; {begins}"
+    return f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; {text}"

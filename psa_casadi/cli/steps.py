@@ -27,10 +27,10 @@ class Course:
     steps: tuple[tuple[str, tuple[str, ...]], ...]
     usual_s: float
 
-    def step_of(self, told: str) -> int:
+    def step_of(self, text: str) -> int:
         """Return the number of the step that tells something, from 1; 0 where none does."""
         for k, (_, marks) in enumerate(self.steps, 1):
-            if told.startswith(marks):
+            if text.startswith(marks):
                 return k
         return 0
 
@@ -86,10 +86,10 @@ class Told:
         self._what, self._course = what, course
         self._begin, self._step, self._said = clock.monotonic(), 0, ""
 
-    def tell(self, said: str) -> None:
+    def tell(self, text: str) -> None:
         """Take what is told; the step never goes back, as parts of a work come again."""
-        self._said = said
-        self._step = max(self._step, self._course.step_of(said))
+        self._said = text
+        self._step = max(self._step, self._course.step_of(text))
 
     def first(self) -> str:
         """Return that the work begins, and what is usual."""

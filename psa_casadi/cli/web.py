@@ -33,7 +33,7 @@ def web(
     port: Annotated[int | None, typer.Option(min=1, max=65535)] = None,
     no_browser: bool = False,
     fitting: Fitting,
-    given: Given,
+    inputs: Given,
 ) -> None:
     """Write a page to play with a stack: any voltage, every effect, no network.
 
@@ -58,35 +58,35 @@ def web(
     if more.args:
         raise InputError(f"{more.args[0]}: is one file too many; give one model, by --model.")
     if diagnose:
-        own = own_model(given, model, fitting)
-        if (model is not None and own is None) or stack is not None or output is not None:
+        item = own_model(inputs, model, fitting)
+        if (model is not None and item is None) or stack is not None or output is not None:
             raise InputError(
                 "--diagnose serves a page of its own: leave --stack, -o and a stack's --model out;"
                 " a MODEL.json to start from is dropped there."
             )
-        given.check()
-        _serve(port or 0, no_browser, _subject(own, model, fitting), given)
+        inputs.check()
+        _serve(port or 0, no_browser, _subject(item, model, fitting), inputs)
         return
     from psa_casadi.report.page.playground import write_playground
 
     path = output or Path("playground.html")
     if port is not None or no_browser:
-        given.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
+        inputs.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
     if fitting != Fitting():
-        given.add("a model of your own is for --diagnose; add that.")
-    given.outputs({"--output": path}, [model], page="--output")
-    chosen = given.model_or_stack(model, stack, needed=False)
-    given.check()
-    with working("compiling", given.quiet):
+        inputs.add("a model of your own is for --diagnose; add that.")
+    inputs.outputs({"--output": path}, [model], page="--output")
+    chosen = inputs.model_or_stack(model, stack, needed=False)
+    inputs.check()
+    with working("compiling", inputs.quiet):
         write_playground(path, chosen)
-    tell_written(path, quiet=given.quiet)
+    tell_written(path, quiet=inputs.quiet)
 
 
-def _subject(own: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
+def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
     """Return what the page diagnoses: a stack, or a model of one's own."""
     from psa_casadi.workbench.subject import Subject
 
-    if own is None:
+    if model is None:
         return Subject()
     words = {"model": path and path.absolute(), **asdict(fitting)}
     if fitting.fmu:
@@ -96,25 +96,25 @@ def _subject(own: "psa.Model | None", path: Path | None, fitting: Fitting) -> "S
         values = value if isinstance(value, list) else [value] if value else []
         begin = f"--{option.replace('_', '-')}"
         arguments += [begin if value is True else f"{begin}={v}" for v in values]
-    units = {i.name: i.unit for i in own.structure.inputs}
-    units |= {o.name: o.unit for o in own.structure.outputs}
-    fmus = tuple(Path(f.place) for f in own.structure.foreign)
-    return Subject(own.input_names, own.output_names, units, tuple(arguments), fmus)
+    units = {i.name: i.unit for i in model.structure.inputs}
+    units |= {o.name: o.unit for o in model.structure.outputs}
+    fmus = tuple(Path(f.place) for f in model.structure.foreign)
+    return Subject(model.input_names, model.output_names, units, tuple(arguments), fmus)
 
 
-def _serve(port: int, no_browser: bool, subject: "Subject", given: Given) -> None:
+def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.workbench.desk import Desk
     from psa_casadi.workbench.server import served
 
-    modules = given.effects or []
+    modules = inputs.effects or []
     here = str(Path.cwd())  # children look for named modules there, and for nothing else
     sys.path[:] = [p for p in sys.path if p not in ("", here)] + ([here] if modules else [])
     with temporary_folder() as place:
         folder = place / "files"
         folder.mkdir()
-        desk = Desk(folder, list(known_effects(given.own)), modules, subject)
+        desk = Desk(folder, list(known_effects(inputs.own)), modules, subject)
         with suppress(KeyboardInterrupt), served(port, desk) as server:
             show(f"Open {server.address}")
             tell("Ctrl-C ends the page and removes its files.")

@@ -248,14 +248,14 @@ def correct(
     variance = c.noise_square
     g: list[Expression] = []
     new: list[list[Expression]] = []
-    for j, (*above, own) in enumerate(m.factors):
+    for j, (*above, item) in enumerate(m.factors):
         f = gate * (sum((u * b for u, b in zip(above, d, strict=False)), d[j]))
-        v, before = own * f, variance
+        v, before = item * f, variance
         variance += f * v
         new.append(
             [
                 *(u - f / before * k for u, k in zip(above, g, strict=True)),
-                own * (before / variance),
+                item * (before / variance),
             ]
         )
         g = [*(k + u * v for k, u in zip(g, above, strict=True)), v]
@@ -265,8 +265,8 @@ def correct(
     z = bounded(c, [a + step * b for a, b in zip(m.z, g, strict=True)])
     stretch = [ca.sqrt(1.0 + gate * c.forget * (1.0 - p)) for p in variances(new)]
     return z, [
-        [*(u * stretch[i] / stretch[j] for i, u in enumerate(above)), own * stretch[j] ** 2]
-        for j, (*above, own) in enumerate(new)
+        [*(u * stretch[i] / stretch[j] for i, u in enumerate(above)), item * stretch[j] ** 2]
+        for j, (*above, item) in enumerate(new)
     ]
 
 
@@ -353,23 +353,23 @@ def _learnt(
     """Return the memory now and after a sample, what that says, and the estimates now."""
     now = _memory(s)
     after = advance(c, now, voltage, s.position)
-    found = dict(zip(TRACKED, estimates(c, now.z), strict=True))
-    shown = {**{f"{name}_hat": value for name, value in found.items()}, "hysteresis_force": now.f}
+    result = dict(zip(TRACKED, estimates(c, now.z), strict=True))
+    table = {**{f"{name}_hat": value for name, value in result.items()}, "hysteresis_force": now.f}
     names = [state.name for state in SAMPLED]
     return (
         now,
         after,
-        Equations(next=dict(zip(names, flattened(after), strict=True)), out=shown),
-        found,
+        Equations(next=dict(zip(names, flattened(after), strict=True)), out=table),
+        result,
     )
 
 
 def _online_identification(s: Symbols) -> Equations:
     c = _constants(s, _PARAMETERS)
-    now, _, said, found = _learnt(s, c, s.voltage)
-    predicted = (found["k_L"] * now.nu + now.phi + found["offset"]) / c.stiffness
-    more = {"correction": -now.f / found["k_L"], "prediction_error": s.position - predicted}
-    return replace(said, out={**said.out, **more})
+    now, _, statement, result = _learnt(s, c, s.voltage)
+    predicted = (result["k_L"] * now.nu + now.phi + result["offset"]) / c.stiffness
+    more = {"correction": -now.f / result["k_L"], "prediction_error": s.position - predicted}
+    return replace(statement, out={**statement.out, **more})
 
 
 _PARAMETERS = (
@@ -473,11 +473,11 @@ def _feed_forward(s: Symbols) -> Equations:
 def _adaptive(s: Symbols) -> Equations:
     """The voltage that was returned last has been applied when the displacement is measured."""
     c = _constants(s, ONLINE_IDENTIFICATION.parameters)
-    _, after, said, _ = _learnt(s, c, s.applied)
+    _, after, statement, _ = _learnt(s, c, s.applied)
     u = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
     return Equations(
-        next={**said.next, "applied": u, "wanted_last": s.wanted},
-        out={"voltage": s.applied, **said.out},
+        next={**statement.next, "applied": u, "wanted_last": s.wanted},
+        out={"voltage": s.applied, **statement.out},
     )
 
 

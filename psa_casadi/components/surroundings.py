@@ -210,8 +210,8 @@ def _on_wafers(s: Symbols) -> Equations:
 
 def _on_tip(s: Symbols) -> Equations:
     mass, held = s.mounted * s.m_m, s.mounted * (s.c_m * s.v_x + s.k_m * s.x)
-    beside = s.transmitted_force + s.load_force - _pull(s)
-    return Equations(add={"tip_force": -(mass * beside + s.m_B * held) / (s.m_B + mass)})
+    others = s.transmitted_force + s.load_force - _pull(s)
+    return Equations(add={"tip_force": -(mass * others + s.m_B * held) / (s.m_B + mass)})
 
 
 _MECHANISM = (

@@ -112,8 +112,8 @@ class OneAxis:
         voltages, displacements = (a[:, :, self.experiment, : self.periods] for a in arrays[-2:])
         axis = own_part(response, voltages, displacements, self.axis)
         voltage = voltages[:, self.axis].T.reshape(-1)
-        shown = self.sign * 1e6 * axis.T.reshape(-1)
-        pairs = zip(voltage.tolist(), shown.tolist(), strict=True)
+        displayed = self.sign * 1e6 * axis.T.reshape(-1)
+        pairs = zip(voltage.tolist(), displayed.tolist(), strict=True)
         return csv_text(pairs, self.sample_rate, 8)
 
 
@@ -144,8 +144,8 @@ def own_part(
     others = np.arange(voltages.shape[1]) != axis
     u = np.fft.rfft(voltages[:, others], axis=0)
     done = np.einsum("kj,kjp->kp", response[:, axis, others], u)
-    own: FloatArray = displacements[:, axis] - np.fft.irfft(done, n=len(voltages), axis=0)
-    return own
+    values: FloatArray = displacements[:, axis] - np.fft.irfft(done, n=len(voltages), axis=0)
+    return values
 
 
 @dataclass(frozen=True)
@@ -253,11 +253,11 @@ def _axis(axis: int, level: int, signal: int | None = None) -> DatasetFile:
     name = f"axis_{axis + 1}_{level}mV{'' if signal is None else f'_test_{signal + 1}'}.csv"
     parts = ("train",) if signal is None else ("train", "test")
     originals = [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"]
-    said = "first training signal" if signal is None else f"test signal {signal + 1}"
+    statement = "first training signal" if signal is None else f"test signal {signal + 1}"
     length = "one period" if signal is None else "two periods"
     return _file(
         name,
-        f"axis {axis + 1} and its own actuator, {said}, {level} mV rms, {length}",
+        f"axis {axis + 1} and its own actuator, {statement}, {level} mV rms, {length}",
         _originals(_MIRROR_FOLDER, *originals),
         OneAxis(axis, SIGNS[axis], signal or 0, len(parts), _RATE),
     )

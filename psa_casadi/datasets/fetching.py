@@ -43,9 +43,9 @@ def copy(name: str, folder: str | os.PathLike[str]) -> list[Path]:
     """
     dataset, target = find(name), Path(folder)
     make_folder(target)
-    found = paths(name)
+    result = paths(name)
     written = []
-    for path in found:
+    for path in result:
         written.append(target / path.name)
         atomic_write(written[-1], path.read_bytes())
     written.append(target / f"{name}_licence.txt")

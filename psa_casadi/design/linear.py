@@ -70,8 +70,8 @@ class Linear(Celled):
     @property
     def poles(self) -> ComplexArray:
         """Eigenvalues of A [1/s], the slowest first."""
-        found = np.linalg.eigvals(self.a).astype(complex)
-        return np.asarray(found[np.argsort(np.abs(found))])
+        result = np.linalg.eigvals(self.a).astype(complex)
+        return np.asarray(result[np.argsort(np.abs(result))])
 
     def __repr__(self) -> str:
         """Return the operating point and the poles."""
@@ -152,9 +152,9 @@ def linearize(
     Raises InputError for unknown names, sampled states, an FMU that is run as a whole, and where no
     rest is found.
     """
-    s, given = model.structure, dict(inputs or {})
+    s, arguments = model.structure, dict(inputs or {})
     known = {"input": model.input_names, "state": model.state_names}
-    for kind, names in (("input", given), ("state", states or {})):
+    for kind, names in (("input", arguments), ("state", states or {})):
         for name in (n for n in names if n not in known[kind]):
             raise InputError(
                 f"The model '{model.name}' has no {kind} '{name}'; it has"
@@ -167,7 +167,7 @@ def linearize(
             "An FMU that is run as a whole has no equations to linearise; model exchange without"
             " events has."
         )
-    u = np.array([given.get(i.name, i.start) for i in s.inputs])
+    u = np.array([arguments.get(i.name, i.start) for i in s.inputs])
     x = np.array([(states or {}).get(q.name, q.start) for q in s.states])
     p, held = (
         model.parameter_vector(),
@@ -199,17 +199,17 @@ def _rest(model: Model, time: float, x: FloatArray, u: FloatArray) -> FloatArray
     scale = np.maximum(np.max(np.abs(slopes), axis=1), 1e-300)
     try:
         with np.errstate(all="ignore"):  # of what runs away
-            found = scipy.optimize.least_squares(
+            result = scipy.optimize.least_squares(
                 rates, x / sizes, x_scale="jac", xtol=1e-15, gtol=1e-15
             )
     except (ValueError, RuntimeError) as error:  # rates that are not finite
         raise InputError(f"No rest of '{model.name}' is found ({error}); give `states`.") from error
-    if not np.max(np.abs(found.fun)) <= _REST:
+    if not np.max(np.abs(result.fun)) <= _REST:
         raise InputError(
             f"No rest of '{model.name}' is found from its starts with these inputs; give `states`,"
             " where it need not rest."
         )
-    return np.asarray(found.x * sizes)
+    return np.asarray(result.x * sizes)
 
 
 def margins(
@@ -276,12 +276,12 @@ def observer(
     )
     moved = u - of.u
     innovation = y - of.y[rows] - c @ x - d @ moved
-    shown = ca.vertcat(x + of.x, of.y + of.c @ x + of.d @ moved)
+    displayed = ca.vertcat(x + of.x, of.y + of.c @ x + of.d @ moved)
     measured = [of.outputs[r] for r in rows]
     shown_as: list[State | Output] = [*of.states, *of.outputs]
     return ode_model(
         {
-            "x": x, "u": ca.vertcat(u, y), "y": shown,
+            "x": x, "u": ca.vertcat(u, y), "y": displayed,
             "ode": of.a @ x + of.b @ moved + gain @ innovation,
         },
         name=f"{of.name}_observer",

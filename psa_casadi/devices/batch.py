@@ -67,16 +67,18 @@ class Results:
 
         With the batch and date that it has now, which are written too.
         """
-        told = self.told(job.device)
-        if told is None or told.key != key or told.status == "failed":
+        device_file = self.told(job.device)
+        if device_file is None or device_file.key != key or device_file.status == "failed":
             return None
-        if len(told.sha256) != len(told.files) or damage(self.folder / job.device, told):
+        if len(device_file.sha256) != len(device_file.files) or damage(
+            self.folder / job.device, device_file
+        ):
             return None
         day = job.day.isoformat() if job.day else ""
-        if (told.batch, told.date) != (job.batch, day):
-            told = replace(told, batch=job.batch, date=day)
-            atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(told)))
-        return told
+        if (device_file.batch, device_file.date) != (job.batch, day):
+            device_file = replace(device_file, batch=job.batch, date=day)
+            atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(device_file)))
+        return device_file
 
     def told(self, device: str) -> DeviceFile | None:
         """Return how a device ended, None where that is not known."""
@@ -98,7 +100,7 @@ class Results:
         (here / DEVICE_FILE).unlink(missing_ok=True)
         for name, text in outcome.files:
             atomic_write(here / name, text)
-        told = DeviceFile(
+        device_file = DeviceFile(
             FORMAT,
             job.device,
             job.batch,
@@ -113,8 +115,8 @@ class Results:
             tuple(name for name, _ in outcome.files),
             tuple(hash_of(text.encode()) for _, text in outcome.files),
         )
-        atomic_write(here / DEVICE_FILE, json_text(asdict(told)))
-        return told
+        atomic_write(here / DEVICE_FILE, json_text(asdict(device_file)))
+        return device_file
 
     def findings(
         self, devices: Sequence[DeviceFile], effects: Sequence[Component] = ()
@@ -123,14 +125,14 @@ class Results:
 
         A device whose files are damaged has failed, with what is wrong among its problems.
         """
-        for told in devices:
+        for output in devices:
             try:
-                found = None
-                if told.status == "done":
-                    found = device_finding(self.folder / told.device, told, effects)
-                yield told, found
+                finding = None
+                if output.status == "done":
+                    finding = device_finding(self.folder / output.device, output, effects)
+                yield output, finding
             except ValueError as error:
-                yield replace(told, status="failed", problems=(str(error),)), None
+                yield replace(output, status="failed", problems=(str(error),)), None
 
 
 def read_results(
@@ -173,12 +175,12 @@ def write_summary(
     empty where the records of a device do not determine it. A column of numbers with a unit that no
     device fills is left out.
     """
-    own = ("device", "batch", "date", "work", "status", "seconds")
+    item = ("device", "batch", "date", "work", "status", "seconds")
     table: list[dict[str, Any]] = [
-        {name: getattr(told, name) for name in own}
-        | {"problems": " ".join(told.problems)}
-        | (finding_content(found) if found else {})
-        for told, found in rows
+        {name: getattr(output, name) for name in item}
+        | {"problems": " ".join(output.problems)}
+        | (finding_content(result) if result else {})
+        for output, result in rows
     ]
     filled = {name for row in table for name, value in row.items() if value is not None}
     every = dict.fromkeys(name for row in table for name in row)
@@ -256,22 +258,22 @@ def batch(
         KeyboardInterrupt: the run was interrupted; what is done is kept, its message says how much.
     """
     began, o = time.monotonic(), options or Options()
-    given = jobs_given(jobs)
+    inputs = jobs_given(jobs)
     effects = [c for module in o.modules for c in own_effects(module).values()]
     results = Results(Path(output))
     try:
-        keys = {job.device: key_of(job, o) for job in given}
+        keys = {job.device: key_of(job, o) for job in inputs}
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); correct its permissions."
         ) from error
     ended: dict[str, DeviceFile] = {}
-    for job in given:
-        told = results.kept(job, keys[job.device])
-        if told is not None:
-            ended[job.device] = told
+    for job in inputs:
+        report = results.kept(job, keys[job.device])
+        if report is not None:
+            ended[job.device] = report
     kept = len(ended)
-    waiting = [job for job in given if job.device not in ended]
+    waiting = [job for job in inputs if job.device not in ended]
     started = time.monotonic()
     try:
         with _executor(executor, workers, len(waiting)) as (where, most):
@@ -281,38 +283,40 @@ def batch(
             run = secrets.token_hex(8)
             tasks = (DeviceTask(job, o, run) for job in waiting)
             for task, outcome in outcomes(tasks, where, at_once or most):
-                told = results.write(task.job, o, keys[outcome.device], outcome)
-                ended[outcome.device] = told
+                report = results.write(task.job, o, keys[outcome.device], outcome)
+                ended[outcome.device] = report
                 elapsed = (time.monotonic() - started) / (len(ended) - kept)
-                progress(_line(told, list(ended.values()), kept, len(given), elapsed))
+                progress(_line(report, list(ended.values()), kept, len(inputs), elapsed))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(ended)} of {len(given)} devices are done. Kept: {output}. The same command goes"
+            f"{len(ended)} of {len(inputs)} devices are done. Kept: {output}. The same command goes"
             " on where it stopped."
         ) from None
     progress("writing the tables")
-    rows = list(results.findings([ended[job.device] for job in given], effects))
+    rows = list(results.findings([ended[job.device] for job in inputs], effects))
     files = write_summary(results.folder, rows)
-    found = tuple(f for _, f in rows if f is not None)
-    devices = tuple(told for told, _ in rows)
-    return BatchRun(results.folder, devices, found, kept, time.monotonic() - began, files)
+    result = tuple(f for _, f in rows if f is not None)
+    devices = tuple(report for report, _ in rows)
+    return BatchRun(results.folder, devices, result, kept, time.monotonic() - began, files)
 
 
 @contextmanager
 def _executor(
-    given: Executor | None, workers: int | None, jobs: int
+    executor: Executor | None, workers: int | None, jobs: int
 ) -> Iterator[tuple[Executor, int]]:
     """Yield what takes the work, and how many devices it gets at a time."""
     cores = os.cpu_count() or 1
-    if given is not None:
-        nthreads = getattr(given, "nthreads", None)  # a client of Dask knows its workers' threads
-        yield given, _AHEAD * (sum(nthreads().values()) if nthreads else cores)
+    if executor is not None:
+        nthreads = getattr(
+            executor, "nthreads", None
+        )  # a client of Dask knows its workers' threads
+        yield executor, _AHEAD * (sum(nthreads().values()) if nthreads else cores)
         return
-    own = Processes(max(1, min(workers or cores, jobs)))
+    processes = Processes(max(1, min(workers or cores, jobs)))
     try:
-        yield own, _AHEAD * own.count
+        yield processes, _AHEAD * processes.count
     finally:
-        own.end()
+        processes.end()
 
 
 def _line(

@@ -66,29 +66,29 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
     o, job = task.options, task.job
     effects = [c for module in o.modules for c in own_effects(module).values()]
     start = loads(o.model, effects=effects) if isinstance(o.model, str) else o.model
-    asked: dict[str, Any] = {"columns": o.columns, "sample_time": o.sample_time}
-    given: tuple[Any, ...]
+    table: dict[str, Any] = {"columns": o.columns, "sample_time": o.sample_time}
+    inputs: tuple[Any, ...]
     words: dict[str, Any]
     records: Sequence[Record | Signals]
     if start is None or is_stack(start):
-        records = read_records(job.files, need_excitation=True, **asked)
-        given = (records,)
+        records = read_records(job.files, need_excitation=True, **table)
+        inputs = (records,)
         words = {"model": start, "stiffness": o.stiffness, "hysteresis": o.hysteresis}
         if o.work == "diagnose":
             words["effects"] = tuple(known_effects(effects).values())
     else:
         records = read_signals(
-            job.files, inputs=start.input_names, outputs=start.output_names, **asked
+            job.files, inputs=start.input_names, outputs=start.output_names, **table
         )
-        given, words = (start, records), dict(o.words)
+        inputs, words = (start, records), dict(o.words)
     _refuse_same(records)
     work: Callable[..., Any] = diagnose if o.work == "diagnose" else identify
-    found = work(*given, progress=silent, **words)
-    if o.work == "identify" and (found.interrupted or found.fit.interrupted):
+    result = work(*inputs, progress=silent, **words)
+    if o.work == "identify" and (result.interrupted or result.fit.interrupted):
         raise KeyboardInterrupt
-    files = [(DIAGNOSIS if o.work == "diagnose" else IDENTIFICATION, found.to_json())]
-    if not found.model.structure.foreign:  # an imported FMU has no file of its model
-        files.append((MODEL, dumps(found.model)))
+    files = [(DIAGNOSIS if o.work == "diagnose" else IDENTIFICATION, result.to_json())]
+    if not result.model.structure.foreign:  # an imported FMU has no file of its model
+        files.append((MODEL, dumps(result.model)))
     return DeviceOutcome(
         job.device, "done", time.monotonic() - began, tuple(files),
         records=tuple((r.name, r.sha256) for r in records),
@@ -97,14 +97,14 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
 
 def _refuse_same(records: Sequence[Record | Signals]) -> None:
     """Refuse records that hold the same data. Raises InputError."""
-    seen: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for r in records:
-        if r.sha256 in seen:
+        if r.sha256 in texts:
             raise InputError(
-                f"{r.source}: holds the same data as {seen[r.sha256]}; a record counts once: remove"
-                " one of the two."
+                f"{r.source}: holds the same data as {texts[r.sha256]}; a record counts once:"
+                " remove one of the two."
             )
-        seen[r.sha256] = r.source
+        texts[r.sha256] = r.source
 
 
 def make_ready(job: Job, options: Options) -> None:
@@ -120,7 +120,7 @@ def make_ready(job: Job, options: Options) -> None:
         start = starting_model(records, options.stiffness)
         models = [start]
         if options.work == "diagnose":
-            own = [c for module in options.modules for c in own_effects(module).values()]
-            table = known_effects(own).values()
+            items = [c for module in options.modules for c in own_effects(module).values()]
+            table = known_effects(items).values()
             models += [start.with_effect(e) for e in table if not e.needs_column]
         compiled(models)

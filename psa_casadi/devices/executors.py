@@ -100,9 +100,11 @@ def _outcome(future: Any, task: DeviceTask, began: float) -> DeviceOutcome:
             " a new one."
         ) from error
     except Exception as error:  # noqa: BLE001 - a cluster may raise anything for a lost worker
-        told = str(error) if isinstance(error, MachineError) else f"{type(error).__name__}: {error}"
+        output = (
+            str(error) if isinstance(error, MachineError) else f"{type(error).__name__}: {error}"
+        )
         seconds = time.monotonic() - began
-        return DeviceOutcome(task.job.device, "failed", seconds, problems=(told,))
+        return DeviceOutcome(task.job.device, "failed", seconds, problems=(output,))
 
 
 @contextmanager

@@ -60,7 +60,7 @@ class Job:
 Jobs = str | os.PathLike[str] | Iterable[Job]
 
 
-def jobs_given(given: Jobs) -> tuple[Job, ...]:
+def jobs_given(inputs: Jobs) -> tuple[Job, ...]:
     """Return the jobs of a folder, a table or a list, in their order.
 
     In a folder with `jobs.csv` that is the table; else every folder in it is a device with all
@@ -70,19 +70,19 @@ def jobs_given(given: Jobs) -> tuple[Job, ...]:
         InputError: every mistake: no records, names that two devices have or that no folder can
             have, files that do not exist.
     """
-    found = _of_path(Path(given)) if isinstance(given, str | os.PathLike) else tuple(given)
+    jobs = _of_path(Path(inputs)) if isinstance(inputs, str | os.PathLike) else tuple(inputs)
     problems = Problems()
-    _check_names(found, problems)
-    for job in found:
+    _check_names(jobs, problems)
+    for job in jobs:
         if not job.files:
             problems.add(f"device '{job.device}' has no records; name files, or leave it out.")
         for name in job.files:
             if not Path(name).is_file():
                 problems.add(f"device '{job.device}': there is no file {name}; correct its name.")
-    if not found:
+    if not jobs:
         problems.add("there is no device; give a folder of records, or a table of jobs.")
     problems.raise_if_any()
-    return found
+    return jobs
 
 
 def _of_path(path: Path) -> tuple[Job, ...]:
@@ -172,8 +172,8 @@ def _usual(table: Path, device: str) -> tuple[str, ...]:
     """Return the records that have a device's name beside its table: a folder, or a file."""
     if _BARRED.search(device):
         return ()
-    beside = sorted(f for f in table.parent.iterdir() if f.is_file() and _named(f) == device)
-    return _records_of(table.parent / device) or tuple(n for f in beside for n in _records_of(f))
+    items = sorted(f for f in table.parent.iterdir() if f.is_file() and _named(f) == device)
+    return _records_of(table.parent / device) or tuple(n for f in items for n in _records_of(f))
 
 
 def _named(place: Path) -> str:
@@ -194,7 +194,7 @@ def _records_of(place: Path) -> tuple[str, ...]:
 
 
 def _check_names(jobs: Sequence[Job], problems: Problems) -> None:
-    seen: set[str] = set()
+    texts: set[str] = set()
     for job in jobs:
         name = job.device
         unfit = not name or _BARRED.search(name) or _RESERVED.fullmatch(name)
@@ -203,12 +203,12 @@ def _check_names(jobs: Sequence[Job], problems: Problems) -> None:
                 f"device {name[:_LONGEST]!r}: no folder can have this name on every system; use up"
                 f" to {_LONGEST} letters, digits, spaces, '-', '_' and dots inside."
             )
-        if name.casefold() in seen:
+        if name.casefold() in texts:
             problems.add(
                 f"device '{name}' is there twice (small and capital letters count as the same);"
                 " rename one of them."
             )
-        seen.add(name.casefold())
+        texts.add(name.casefold())
 
 
 @dataclass(frozen=True)
@@ -264,5 +264,5 @@ def key_of(job: Job, options: Options) -> str:
             ([declaration_hash(c) for c in model.components], sorted(model.values.items()))
         )
     content = asdict(replace(options, model=model))
-    told = {"version": __version__, "options": content, "files": files}
-    return sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    table = {"version": __version__, "options": content, "files": files}
+    return sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()

@@ -71,8 +71,10 @@ def images(tone: float, rate: float, most: int) -> list[float]:
 
     At half the sampling rate these are pairs, apart by rounding only.
     """
-    found = {round(abs(k + sign * tone / rate), 9) for k in range(most + 1) for sign in (1.0, -1.0)}
-    return [share * rate for share in sorted(found)]
+    result = {
+        round(abs(k + sign * tone / rate), 9) for k in range(most + 1) for sign in (1.0, -1.0)
+    }
+    return [share * rate for share in sorted(result)]
 
 
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
@@ -94,8 +96,8 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     for tone in _TONES:
         columns = [_response(forces, experiments, interval, tone, d) for d in _DECAYS]
         free = without(colour.whiten(np.hstack(columns)), basis)
-        for decay, own in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
-            decrease = _explained(own, residual) / colour.level**2
+        for decay, item in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
+            decrease = _explained(item, residual) / colour.level**2
             if best is None or decrease > best.decrease:
                 best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
     return best
@@ -107,16 +109,16 @@ def _explained(columns: FloatArray, residual: FloatArray) -> float:
     A sixth of the time of their orthonormal basis by `independent`. Of one in the other's
     direction, and of none, nothing counts.
     """
-    found = 0.0
+    value = 0.0
     first: FloatArray | None = None
     for column in np.ascontiguousarray(columns.T):
         size = float(np.linalg.norm(column))
-        own = column if first is None else column - (first @ column) * first
-        norm = float(np.linalg.norm(own))
+        item = column if first is None else column - (first @ column) * first
+        norm = float(np.linalg.norm(item))
         if norm > _NEW * size:
-            first = own / norm
-            found += float(first @ residual) ** 2
-    return found
+            first = item / norm
+            value += float(first @ residual) ** 2
+    return value
 
 
 def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> FloatArray | None:
@@ -140,8 +142,8 @@ def _force(fit: Fit, number: int, experiment: Experiment, interval: float) -> Fl
 def _places(experiment: Experiment, interval: float) -> IndexArray:
     """Return which of the even samples each sample of a record is, or is next to."""
     time = experiment.record.time
-    found: IndexArray = np.rint((time - time[0]) / interval).astype(np.int64)
-    return found
+    indices: IndexArray = np.rint((time - time[0]) / interval).astype(np.int64)
+    return indices
 
 
 def _response(
@@ -156,13 +158,13 @@ def _response(
     poles = [1.0, -2.0 * z.real, abs(z) ** 2]
     parts = []
     for force, e in zip(forces, experiments, strict=True):
-        own = np.zeros((int(e.used.sum()), 2))
+        item = np.zeros((int(e.used.sum()), 2))
         if force is not None:
             where = _places(e, interval)[e.used]
             rung = filtered([1.0, -1.0], poles, force)
-            own[:, 0] = rung[where]
-            own[:, 1] = np.append(0.0, rung)[where]  # a sample later
-        parts.append(own)
+            item[:, 0] = rung[where]
+            item[:, 1] = np.append(0.0, rung)[where]  # a sample later
+        parts.append(item)
     return np.vstack(parts)
 
 
@@ -204,9 +206,9 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     best = base
     for model in (ordinary, base.model):
         with suppress(PsaError):
-            own = search(model, experiments, linear=linear.candidates, progress=progress).best
-            best = min(best, own, key=lambda f: f.rms)
-            if own.cost < _AGAIN * len(own.residuals):
+            item = search(model, experiments, linear=linear.candidates, progress=progress).best
+            best = min(best, item, key=lambda f: f.rms)
+            if item.cost < _AGAIN * len(item.residuals):
                 break
     return best if _short(base, best) > _CLEAR else None
 
@@ -218,22 +220,22 @@ def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress
     Steps excite such a resonance, and what a slow record shows of its ringing looks like noise
     after each step. `before` may hold causes; the mechanics is sought again where it holds none.
     """
-    found = before
+    result = before
     for _ in range(_RESONANCES):
-        more = _with_ringing(found, experiments, progress, SEEN)
+        more = _with_ringing(result, experiments, progress, SEEN)
         if more is None:
             break
-        found = more
-    if found.rms > _MUCH * before.rms:
+        result = more
+    if result.rms > _MUCH * before.rms:
         return None
-    return found if before.model.effects else _tuned(found, experiments, progress)
+    return result if before.model.effects else _tuned(result, experiments, progress)
 
 
 @stage("base fit again")
 def instead_of_mode(
-    before: Fit, mode: Component, found: Fit, experiments: Sequence[Experiment], progress: Progress
+    before: Fit, mode: Component, fit: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit with a resonance of the stack's own where a further mode was `found`.
+    """Fit with a resonance of the stack's own where a further mode was `fit`.
 
     `before` is the model to which the mode was added. A stack that rings near the sampling rate
     shows a tone at one of its images, |k f_s + f| and |k f_s - f|, which decays as fast: its
@@ -241,33 +243,33 @@ def instead_of_mode(
     well as the mode.
     """
     progress("base fit, mode as resonance")
-    values = found.model.values
+    values = fit.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
     rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
     near = images(tone, rate, _NEAR_IMAGES)
     starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
-    return _with_masses(before, starts, experiments, _as_good(found, _AS_GOOD))
+    return _with_masses(before, starts, experiments, _as_good(fit, _AS_GOOD))
 
 
 @stage("base fit again")
 def instead_of(
-    base: Fit, found: Fit, experiments: Sequence[Experiment], progress: Progress
+    base: Fit, fit: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with resonances of its own where an effect was `found`.
+    """Fit the base with resonances of its own where an effect was `fit`.
 
     None where no masses explain the data about as well as the effect. A resonance above the band
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    own = _with_ringing(base, experiments, progress, least=_as_good(found, _LIKE))
-    if own is not None and _short(own, found) < _LIKE:
-        return _tuned(own, experiments, progress)
+    item = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
+    if item is not None and _short(item, fit) < _LIKE:
+        return _tuned(item, experiments, progress)
     if not shows_ringing(experiments):
         return None
-    again = retuned(base, experiments, progress, reached=found.rms)
+    again = retuned(base, experiments, progress, reached=fit.rms)
     if _short(base, again) <= _CLEAR:
         return None
-    return without_blur(again, experiments) if _short(again, found) < _LIKE else None
+    return without_blur(again, experiments) if _short(again, fit) < _LIKE else None
 
 
 def rings(effect: Component) -> bool:
@@ -275,17 +277,17 @@ def rings(effect: Component) -> bool:
     return effect.tone is not None and effect.belongs_to == "plant"
 
 
-def _tuned(found: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def _tuned(fit: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
     """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
-    left = ringing(found, experiments)
+    left = ringing(fit, experiments)
     if left is None or left.decrease >= SEEN:
-        found = retuned(found, experiments, progress)
-    return without_blur(found, experiments)
+        fit = retuned(fit, experiments, progress)
+    return without_blur(fit, experiments)
 
 
-def _short(found: Fit, other: Fit) -> float:
+def _short(fit: Fit, other: Fit) -> float:
     """Return n ln(rms of a fit / rms of another one)."""
-    return len(other.residuals) * float(np.log(found.rms / other.rms))
+    return len(other.residuals) * float(np.log(fit.rms / other.rms))
 
 
 def _as_good(other: Fit, short: float) -> float:
@@ -297,12 +299,12 @@ def _with_ringing(
     fit: Fit,
     experiments: Sequence[Experiment],
     progress: Progress,
-    seen: float = 0.0,
+    value: float = 0.0,
     least: float = np.inf,
 ) -> Fit | None:
     """Fit with a mass free, from the resonances that the residual's ringing may be of.
 
-    None where it shows less than `seen`, a decrease of the whitened sum of squares, or where none
+    None where it shows less than `value`, a decrease of the whitened sum of squares, or where none
     explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
     elsewhere, too.
     """
@@ -310,7 +312,7 @@ def _with_ringing(
     if rate <= _SHOWS:
         return None
     tone = ringing(fit, experiments)
-    if tone is None or tone.decrease < seen:
+    if tone is None or tone.decrease < value:
         return None
     progress(f"base fit, resonance at {tone.tone:.3g} Hz")
     starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
@@ -354,8 +356,8 @@ def _with_masses(
         )  # fmt: skip
 
     limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
-    found = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
-    ended = side_by_side(further, sorted(found, key=lambda f: f.cost)[:_BEST])
+    items = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
+    ended = side_by_side(further, sorted(items, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None

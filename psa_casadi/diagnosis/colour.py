@@ -77,9 +77,9 @@ class Colour:
         for a, power, length in records:
             part = signal[first : first + length]
             if a.size and length > a.size:
-                own = white[first : first + length]
-                own[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                own[: a.size] = self.begins * part[: a.size] / np.sqrt(power)
+                item = white[first : first + length]
+                item[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
+                item[: a.size] = self.begins * part[: a.size] / np.sqrt(power)
             first += length
         if self.spread is not None:
             white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))
@@ -92,11 +92,11 @@ class Colour:
         """
         if not further:
             return self.whiten(signal)
-        beside = [
-            self.level / own.level * own.whiten(part)
-            for own, part in zip(self.further, further, strict=True)
+        items = [
+            self.level / item.level * item.whiten(part)
+            for item, part in zip(self.further, further, strict=True)
         ]
-        return np.concatenate([self.whiten(signal), *beside])
+        return np.concatenate([self.whiten(signal), *items])
 
 
 def colour_of(
@@ -116,20 +116,20 @@ def colour_of(
     sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so that those
     remain visible after whitening.
     """
-    given = list(known or [None] * len(lengths))
+    items = list(known or [None] * len(lengths))
     top = bottom = 0.0
     ends = np.cumsum(lengths)[:-1]
-    for part, own in zip(np.split(remainder, ends), given, strict=True):
-        if own is None:
+    for part, item in zip(np.split(remainder, ends), items, strict=True):
+        if item is None:
             top += float(part[1:] @ part[:-1])
             bottom += float(part @ part)
-    seen = top / bottom if bottom > 0 else 0.0
+    observed = top / bottom if bottom > 0 else 0.0
     if removed is not None and bottom > 0:
-        pairs = zip(np.split(removed, ends), given, strict=True)
-        seen = _before(seen, [q for q, own in pairs if own is None and len(q)])
-    correlation = float(np.clip(seen, 0.0, _LARGEST))
+        pairs = zip(np.split(removed, ends), items, strict=True)
+        observed = _before(observed, [q for q, item in pairs if item is None and len(q)])
+    correlation = float(np.clip(observed, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
-    each = tuple(shared if own is None else own for own in given)
+    each = tuple(shared if item is None else item for item in items)
     return _with_level(each, remainder, lengths)
 
 
@@ -161,31 +161,33 @@ def _correlated(r: float, columns: FloatArray) -> FloatArray:
 
 def _beside(columns: FloatArray) -> FloatArray:
     """Return half the sum of the neighbours on either side."""
-    found = np.zeros_like(columns)
-    found[1:] += 0.5 * columns[:-1]
-    found[:-1] += 0.5 * columns[1:]
-    return found
+    values = np.zeros_like(columns)
+    values[1:] += 0.5 * columns[:-1]
+    values[:-1] += 0.5 * columns[1:]
+    return values
 
 
-def _before(seen: float, removed: Sequence[FloatArray]) -> float:
-    """Return the correlation of which `seen` is left after the projection.
+def _before(value: float, removed: Sequence[FloatArray]) -> float:
+    """Return the correlation of which `value` is left after the projection.
 
     Where what is left hardly grows with it any more (`_TOLD`), the correction stays as it was at
     the last place where it did; there is none where the directions are `_MANY` of the samples.
     """
     samples, directions = sum(len(part) for part in removed), removed[0].shape[1]
     if directions > _MANY * samples:
-        return seen
-    own, left = [0.0], [left_correlation(0.0, removed)]
+        return value
+    item, left = [0.0], [left_correlation(0.0, removed)]
     for r in _TRIED:
-        if seen <= left[-1]:
+        if value <= left[-1]:
             break
         more = left_correlation(r, removed)
-        if more - left[-1] < _TOLD * (r - own[-1]):
+        if more - left[-1] < _TOLD * (r - item[-1]):
             break
-        own.append(r)
+        item.append(r)
         left.append(more)
-    return float(np.interp(seen, left, own)) + min(0.0, seen - left[0]) + max(0.0, seen - left[-1])
+    return (
+        float(np.interp(value, left, item)) + min(0.0, value - left[0]) + max(0.0, value - left[-1])
+    )
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:
@@ -200,7 +202,7 @@ def noise_rms(residual: FloatArray, colour: Colour) -> float:
 def noise_left(fit: Fit, colour: Colour) -> list[float]:
     """Return the noise in every output's residual, over the shares that weighted it."""
     rows = zip(fit.channels, colour.each, strict=True)
-    return [noise_rms(o.residuals, own) for o, own in rows]
+    return [noise_rms(o.residuals, item) for o, item in rows]
 
 
 def noise_told(
@@ -210,13 +212,13 @@ def noise_told(
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
-    told, levels = with_noise(fit, experiments), []
-    for o, own in zip(fit.channels, colour.each, strict=True):
+    output, levels = with_noise(fit, experiments), []
+    for o, item in zip(fit.channels, colour.each, strict=True):
         j = o.number
         rows = zip(o.records, o.parts, strict=True)
-        left = np.concatenate([p * (experiments[k].share(j) / told[k].share(j)) for k, p in rows])
-        levels.append(noise_rms(left, own) * noise_share(told, j))
-    return told, tuple(levels)
+        left = np.concatenate([p * (experiments[k].share(j) / output[k].share(j)) for k, p in rows])
+        levels.append(noise_rms(left, item) * noise_share(output, j))
+    return output, tuple(levels)
 
 
 def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:

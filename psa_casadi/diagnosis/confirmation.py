@@ -101,19 +101,19 @@ def held_out_excess(
     make an error there too, so that only a clear excess counts. One below what can be told of a
     stack does not.
     """
-    own = [not e.held_out_whole for e in experiments]
+    items = [not e.held_out_whole for e in experiments]
     parts = held_out_residuals(experiments, predicted)
     beyond = [
         rms(part) / floor.level
-        for part, floor, mine in zip(parts, noise, own, strict=True)
+        for part, floor, mine in zip(parts, noise, items, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    found = held_out_within(colour, len(fit.theta), limits) if all(own) else Excess()
+    excess = held_out_within(colour, len(fit.theta), limits) if all(items) else Excess()
     worst = max(beyond, default=0.0)
-    if worst > max(limits.unseen_ratio_of_records, found.factor):
-        found = Excess(worst, limits.unseen_alarm)
-    size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / found.factor**2))
-    return found if size > knowable_of(fit, experiments, limits) else Excess()
+    if worst > max(limits.unseen_ratio_of_records, excess.factor):
+        excess = Excess(worst, limits.unseen_alarm)
+    size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / excess.factor**2))
+    return excess if size > knowable_of(fit, experiments, limits) else Excess()
 
 
 def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
@@ -127,8 +127,8 @@ def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
     kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
     spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
     chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
-    tells = chance < limits.unseen_alarm and ratio > limits.unseen_ratio**2
-    return Excess(float(np.sqrt(ratio)), chance) if tells else Excess()
+    reports = chance < limits.unseen_alarm and ratio > limits.unseen_ratio**2
+    return Excess(float(np.sqrt(ratio)), chance) if reports else Excess()
 
 
 #: Shares of the samples, and of the voltage's span, that are worth a word.
@@ -151,10 +151,10 @@ def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
     if not fitted or few is not None:
         return () if few is None else (note("held_out_says_little", why=few),)
     notes = []
-    for code, asked, known in (
+    for code, requested, known in (
         ("extrapolates", held, fitted), ("not_held_out", fitted, held),
     ):  # fmt: skip
-        share, kinds = _without_like(asked, known)
+        share, kinds = _without_like(requested, known)
         if share > _SAMPLES:
             notes.append(note(code, share=share, kinds=kinds))
     used = np.concatenate([e.record.voltage[e.used] for e in experiments])
@@ -165,8 +165,8 @@ def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
     return tuple(notes)
 
 
-def _without_like(asked: dict[Kind, int], known: dict[Kind, int]) -> tuple[float, tuple[str, ...]]:
+def _without_like(table: dict[Kind, int], known: dict[Kind, int]) -> tuple[float, tuple[str, ...]]:
     """Return the share of samples whose kind is not near any `known` one, and the largest kinds."""
-    alone = {k: n for k, n in asked.items() if not any(k.near(other) for other in known)}
+    alone = {k: n for k, n in table.items() if not any(k.near(other) for other in known)}
     first = sorted(alone, key=lambda k: -alone[k])[:2]
-    return sum(alone.values()) / sum(asked.values()), tuple(k.words for k in first)
+    return sum(alone.values()) / sum(table.values()), tuple(k.words for k in first)

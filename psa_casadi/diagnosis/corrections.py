@@ -118,8 +118,8 @@ def time_constants(records: Sequence[Record]) -> FloatArray:
     shortest = min(r.sample_time for r in records)
     longest = _LONGEST * max(r.duration for r in records)
     count = max(2, round(_PER_DECADE * float(np.log10(longest / shortest))))
-    found: FloatArray = np.geomspace(shortest, longest, count)
-    return found
+    values: FloatArray = np.geomspace(shortest, longest, count)
+    return values
 
 
 def _modes(s: Signals, k: int) -> FloatArray:
@@ -307,12 +307,12 @@ class FreeFunction(Correction):
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
         names = ("port", "of", "evidence", "share", "unit", "variable", "equation")
-        told = {n: asdict(e) for n, e in self.parameters.items()}
-        return {**{n: getattr(self, n) for n in names}, "parameters": told}
+        table = {n: asdict(e) for n, e in self.parameters.items()}
+        return {**{n: getattr(self, n) for n in names}, "parameters": table}
 
 
 def best_of(
-    found: Sequence[Correction],
+    result: Sequence[Correction],
     experiments: Sequence[Experiment],
     held: Sequence[float],
     colour: Colour,
@@ -328,12 +328,12 @@ def best_of(
     def gained(c: Correction) -> float:
         rows = zip(samples, colour.each, held, c.held, strict=False)
         return sum(
-            n / own.inflation * float(np.log(before / max(after, 1e-300)))
-            for n, own, before, after in rows
+            n / item.inflation * float(np.log(before / max(after, 1e-300)))
+            for n, item, before, after in rows
         )
 
-    told = [c for c in found if c.evidence > limits.price]
-    good = [c for c in told if not any(samples) or gained(c) > limits.held_out]
+    items = [c for c in result if c.evidence > limits.price]
+    good = [c for c in items if not any(samples) or gained(c) > limits.held_out]
     if not good:
         return None
     best = max(good, key=lambda c: c.evidence)
@@ -351,8 +351,8 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
-    found = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
-    return tuple(sorted(found, key=lambda c: -c.evidence))
+    items = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
+    return tuple(sorted(items, key=lambda c: -c.evidence))
 
 
 class _Following:
@@ -402,10 +402,10 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
     free = follow.beside(used)
     weights, evidence = _weights(free, follow.target)
-    own = tuple(p @ (shape * weights) for p in parts)
+    item = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
-    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, own, strict=True))
+    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, item, strict=True))
     return Patch(
         port=kind.port,
         evidence=evidence,
@@ -413,7 +413,7 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
         predicted=predicted,
         kind=kind.name,
         weights=weights * shape,
-        added=own,
+        added=item,
         moved=moved,
     )
 

@@ -98,18 +98,18 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     turned = [
         replace(e, record=replace(e.record, displacement=-measured(e.record))) for e in experiments
     ]
-    other, shown = 0.0, max(share, 0.0)
+    other, displayed = 0.0, max(share, 0.0)
     with suppress(PsaError):
         other = explained(fit_base(model, turned), turned)
     if other > max(share, limits.follows):
-        return Driven(False, (note("flipped", flipped=other, share=shown), *notes))
+        return Driven(False, (note("flipped", flipped=other, share=displayed), *notes))
     if share < limits.follows:
         linear = filtered(experiments)
         if linear > limits.follows:
-            return Driven(False, (note("filtered", linear=linear, share=shown), *notes), True)
+            return Driven(False, (note("filtered", linear=linear, share=displayed), *notes), True)
         quantity = doubtful_quantity(records)
-        said = note("not_driven", share=shown)
-        return Driven(False, (said, quantity) if quantity else (said,))
+        statement = note("not_driven", share=displayed)
+        return Driven(False, (statement, quantity) if quantity else (statement,))
     return Driven(follows=True, notes=notes)
 
 
@@ -121,11 +121,11 @@ def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
     """
     left = total = 0.0
     for e, y in zip(experiments, base.predicted(experiments), strict=True):
-        given = measured(e.record)
-        valid = np.isfinite(given)
+        inputs = measured(e.record)
+        valid = np.isfinite(inputs)
         time, v = e.record.time[valid], e.record.voltage[valid]
         moving = np.sum(_about_trend(time, v) ** 2) > _TREND * np.sum((v - np.mean(v)) ** 2)
-        rows = ((given - y)[valid], given[valid])
+        rows = ((inputs - y)[valid], inputs[valid])
         about = [_about_trend(time, r) if moving else r - np.mean(r) for r in rows]
         left += float(np.sum(about[0] ** 2))
         total += float(np.sum(about[1] ** 2))
@@ -135,8 +135,8 @@ def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
 def _about_trend(time: FloatArray, signal: FloatArray) -> FloatArray:
     t = (time - time[0]) / max(float(time[-1] - time[0]), 1e-300)
     columns = np.column_stack([np.ones_like(t), t, t**2])
-    found: FloatArray = signal - columns @ np.linalg.lstsq(columns, signal, rcond=None)[0]
-    return found
+    values: FloatArray = signal - columns @ np.linalg.lstsq(columns, signal, rcond=None)[0]
+    return values
 
 
 def filtered(experiments: Sequence[Experiment]) -> float:
@@ -152,10 +152,10 @@ def filtered(experiments: Sequence[Experiment]) -> float:
         past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
         lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]
         time = record.time[record.mask]
-        shown, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
-        rest = shown - columns @ np.linalg.lstsq(columns, shown, rcond=None)[0]
+        displayed, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
+        rest = displayed - columns @ np.linalg.lstsq(columns, displayed, rcond=None)[0]
         left += record.n * float(np.sum(rest**2)) / max(rest.size - taps - 3, 1)
-        total += record.n * float(np.sum(shown**2)) / max(rest.size - 3, 1)
+        total += record.n * float(np.sum(displayed**2)) / max(rest.size - 3, 1)
     return 1.0 - left / total if total > 0 else 0.0
 
 
@@ -182,7 +182,7 @@ def decisions(
     if is_measured(experiments):
         columns.append(LOAD)
     first, last, colour = steps[0].view.of, steps[-1].view.of, steps[-1].screening.colour
-    found = []
+    items = []
     for column in columns:
         task.progress(f"the same without {column}")
         effects = task.table
@@ -196,8 +196,8 @@ def decisions(
         )
         k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
         gained = further_gains(first.fit, last.fit, colour).get(column, 0.0)
-        own = {e.name: e for e in effects}
-        found.append(
+        item = {e.name: e for e in effects}
+        items.append(
             Decision(
                 column=column,
                 role="input" if k is None else "output",
@@ -209,22 +209,22 @@ def decisions(
                 named_without=then,
                 ruled_out=tuple(n for n in then if n not in now),
                 evidence=gained,
-                outcome=decided(column, now, then, gained, own, clear=verdict == "adequate"),
+                outcome=decided(column, now, then, gained, item, clear=verdict == "adequate"),
             )
         )
-    return tuple(found)
+    return tuple(items)
 
 
 def _named(steps: Sequence[Step], limits: Thresholds) -> dict[str, float]:
     """Return the named set of every cause, with the probability of each effect."""
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for step in steps:
         if step.chosen is None:
             continue
         for name in (step.cause.name, *told_from(step, limits)):
             if step.probability.get(name, 0.0) >= _RIVAL:
-                found.setdefault(name, step.probability[name])
-    return found
+                values.setdefault(name, step.probability[name])
+    return values
 
 
 def decided(
@@ -299,17 +299,17 @@ def diagnose(
     model so far at a keyboard interrupt once there is one.
     """
     method, device = method or Method(), (model, stiffness, hysteresis)
-    given, kept = records_given(records), records_given(holdout)
+    inputs, kept = records_given(records), records_given(holdout)
     sound, since = records_given(reference), None
     if sound:
         known = identify(
             sound, model=model, stiffness=stiffness, hysteresis=hysteresis, progress=progress
         )
         progress("what the reference leaves open")
-        since = Healthy(known.fit, known.experiments).since([*given, *kept])
-        given, kept = since.taken_off(len(given))
+        since = Healthy(known.fit, known.experiments).since([*inputs, *kept])
+        inputs, kept = since.taken_off(len(inputs))
         method, device = since.method(method), (known.model, stiffness, hysteresis)
-    return _diagnosed((given, kept), device, effects, (method, progress, watch), since)
+    return _diagnosed((inputs, kept), device, effects, (method, progress, watch), since)
 
 
 def _diagnosed(
@@ -324,20 +324,24 @@ def _diagnosed(
     `device` are model, stiffness and hysteresis as `diagnose` takes them, `work` are method,
     progress and watch; `since` is what is known of healthy records.
     """
-    (given, kept), (model, stiffness, hysteresis), (method, progress, watch) = records, device, work
+    (inputs, kept), (model, stiffness, hysteresis), (method, progress, watch) = (
+        records,
+        device,
+        work,
+    )
     with stage("preparing"):
         table = list(effects if effects is not None else known_effects().values())
-        (whole, cut), (held, cut_too) = without_gaps(given), without_gaps(kept)
+        (whole, cut), (held, cut_too) = without_gaps(inputs), without_gaps(kept)
         ordered, apart = in_one_order(whole), in_one_order(held)
-        clean, said, hidden = _cleaned(ordered)
-        said += [*cut, *cut_too]
+        clean, statement, hidden = _cleaned(ordered)
+        statement += [*cut, *cut_too]
         judged = [cleaned(r) for r in apart]
         if "one clock" not in method.without:
-            clean, judged = _on_one_clock(clean, said), _on_one_clock(judged, said)
+            clean, judged = _on_one_clock(clean, statement), _on_one_clock(judged, statement)
         (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
         start, scale_given = chosen_start(clean, model, stiffness)
         (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-        said += [*means, *means_too, *long, *long_too]
+        statement += [*means, *means_too, *long, *long_too]
         experiments = divided(clean, judged)
         columns = columns_of(start, [e.record for e in experiments])
         experiments = with_levels(experiments, columns.fitted)
@@ -351,7 +355,7 @@ def _diagnosed(
         start = start.without(c.name for c in searched if c.gain is not None)
         there = {c.name for c in start.components}
         table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-        said += [*columns.left_out, *([why] if why else [])]
+        statement += [*columns.left_out, *([why] if why else [])]
     so_far: list[Fit] = []
     task = Task(
         experiments,
@@ -368,8 +372,8 @@ def _diagnosed(
         laws = laws_of(start, [e.record for e in experiments if e.stop], table)
         # from the end: the screening begins at the front
         with compiled_ahead(reversed(screened_with(start, table, laws))):
-            found = _against(since, start, task, scale_given)
-        return _with_noise(found, said, (*whole, *held))
+            stack_diagnosis = _against(since, start, task, scale_given)
+        return _with_noise(stack_diagnosis, statement, (*whole, *held))
     except KeyboardInterrupt:
         if not so_far:
             raise
@@ -377,12 +381,16 @@ def _diagnosed(
 
 
 def _with_noise(
-    found: StackDiagnosis, said: Sequence[Note | str], given: Sequence[Record]
+    stack_diagnosis: StackDiagnosis, statement: Sequence[Note | str], records: Sequence[Record]
 ) -> StackDiagnosis:
-    """Return a diagnosis with what else is `said`, and the noise that its extended model leaves."""
-    driven = found.verdict != "not_driven"
-    noise = noise_found(found.extended_fit, found.experiments, given) if driven else ()
-    return found.with_noise(noise, said)
+    """Return a diagnosis with further notes, and the noise that its extended model leaves."""
+    driven = stack_diagnosis.verdict != "not_driven"
+    noise = (
+        noise_found(stack_diagnosis.extended_fit, stack_diagnosis.experiments, records)
+        if driven
+        else ()
+    )
+    return stack_diagnosis.with_noise(noise, statement)
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -395,21 +403,21 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_still(records)
     refuse_wrapped(records)
     refuse_other_time(records)
-    found = [suspects(r) for r in records]
-    clean = [masked(r, s) for r, s in zip(records, found, strict=True)]
+    items = [suspects(r) for r in records]
+    clean = [masked(r, s) for r, s in zip(records, items, strict=True)]
     saturation = tuple(
-        s for r, own in zip(records, found, strict=True) for s in own.saturation(r.name)
+        s for r, item in zip(records, items, strict=True) for s in item.saturation(r.name)
     )
     refuse_few(records, clean, texts(saturation))
-    said: list[Note | str] = [*saturation]
-    saturated = sum(own.counts["saturated"] for own in found)
-    return clean, said, saturated / max(1, sum(int(r.mask.sum()) for r in records))
+    statement: list[Note | str] = [*saturation]
+    saturated = sum(item.counts["saturated"] for item in items)
+    return clean, statement, saturated / max(1, sum(int(r.mask.sum()) for r in records))
 
 
-def _on_one_clock(records: Sequence[Record], said: list[Note | str]) -> list[Record]:
-    """Return the records with their readings on one clock; what is done to them goes to `said`."""
+def _on_one_clock(records: Sequence[Record], statement: list[Note | str]) -> list[Record]:
+    """Return the records with their readings on one clock; `statement` gets what is done."""
     done = [on_one_clock(r) for r in records]
-    said += [s for _, own in done for s in own]
+    statement += [s for _, item in done for s in item]
     return [r for r, _ in done]
 
 
@@ -439,11 +447,13 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     read: list[Note] = []
     base, task = _on_even_clock(base, start, task, read)
     experiments = task.experiments
-    seen = driven(base, start, task)
-    if not seen.follows:
+    observed = driven(base, start, task)
+    if not observed.follows:
         steps = unsearched(base, task)
-        found = StackJudge(steps, task, scale_given=scale_given, driven=seen.filtered).conclude()
-        return replace(found, remarks=(*found.remarks, *seen.notes))
+        result = StackJudge(
+            steps, task, scale_given=scale_given, driven=observed.filtered
+        ).conclude()
+        return replace(result, remarks=(*result.remarks, *observed.notes))
     steps = steps_of(best_first(base, task), task)
     task.keep(steps[-1].fit)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
@@ -453,28 +463,30 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
         experiments = task.experiments
     steps, task = _between_samples(steps, start, task, read)
     progress("judging")
-    found = StackJudge(steps, task, scale_given=scale_given).conclude()
-    decided = decisions(steps, task, every, lambda other: _searched(start, other)[0], found.verdict)
-    found = replace(found, columns=decided)
+    result = StackJudge(steps, task, scale_given=scale_given).conclude()
+    decided = decisions(
+        steps, task, every, lambda other: _searched(start, other)[0], result.verdict
+    )
+    result = replace(result, columns=decided)
     read += [note("stuck", count=stuck)] if stuck else []
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    told = *seen.notes, *read, *turned, *steps[-1].remarks
-    return replace(found, remarks=(*found.remarks, *told))
+    output = *observed.notes, *read, *turned, *steps[-1].remarks
+    return replace(result, remarks=(*result.remarks, *output))
 
 
-def _on_even_clock(base: Fit, start: Model, task: Task, said: list[Note]) -> tuple[Fit, Task]:
+def _on_even_clock(base: Fit, start: Model, task: Task, notes: list[Note]) -> tuple[Fit, Task]:
     """Fit the base to samples at even times where the data say that the stamps jitter."""
     even = None if "one clock" in task.method.without else even_clock(base, task.experiments)
     if even is not None:
         again, other = _base(start, replace(task, experiments=even[0]))
         if again.rms < base.rms:
-            said.append(even[1])
+            notes.append(even[1])
             return again, other
     return base, task
 
 
 def _between_samples(
-    steps: list[Step], start: Model, task: Task, said: list[Note]
+    steps: list[Step], start: Model, task: Task, notes: list[Note]
 ) -> tuple[list[Step], Task]:
     """Search again with a voltage that is smooth between samples where the data say so."""
     between = None
@@ -483,7 +495,7 @@ def _between_samples(
     if between is not None:
         again, other = _searched(start, replace(task, experiments=between[0]))
         if again[0].fit.rms < steps[0].fit.rms:
-            said.append(between[1])
+            notes.append(between[1])
             return again, other
     return steps, task
 

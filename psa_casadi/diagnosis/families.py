@@ -68,14 +68,14 @@ class Shown:
 def families(
     probability: Mapping[str, float],
     places: Mapping[str, tuple[str, str]],
-    shown: Shown,
+    displayed: Shown,
     corrections: Sequence[Correction],
     limits: Thresholds,
 ) -> tuple[Family, ...]:
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; what is `shown` of the cause is over the model without it, beside which the
+    families; what is `displayed` of the cause is over the model without it, beside which the
     `corrections` stand. With the evidence F_k, above the price of a cause, of each correction and
     that E of the cause, the odds that it is not listed are
 
@@ -87,24 +87,24 @@ def families(
     lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
     missing to 1 is of no kind that was tried (`Shown.known`).
     """
-    evidence = shown.evidence
+    evidence = displayed.evidence
     form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
-    own = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    item = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]
-    most = max([evidence, *(e for family, e in apart if family[1] in own)])
+    most = max([evidence, *(e for family, e in apart if family[1] in item)])
     others: dict[tuple[str, str], float] = {}
     for family, each in apart:
-        if "" not in own:
-            ahead = limits.enough * each - evidence if family[1] in own else each - most
+        if "" not in item:
+            ahead = limits.enough * each - evidence if family[1] in item else each - most
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     odds_of_all = bool(probability) + sum(others.values())
-    listed = shown.known(limits) / odds_of_all if odds_of_all else 0.0
-    found: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
+    listed = displayed.known(limits) / odds_of_all if odds_of_all else 0.0
+    table: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:
-            found.setdefault(places[name], {})[name] = p * listed
+            table.setdefault(places[name], {})[name] = p * listed
     rows = (
         Family(
             *family,
@@ -112,7 +112,7 @@ def families(
             effects={n: p for n, p in effects.items() if p > _LEAST},
             not_listed=others.get(family, 0.0) * listed,
         )
-        for family, effects in found.items()
+        for family, effects in table.items()
     )
-    told = (f for f in rows if f.probability > _LEAST)
-    return tuple(sorted(told, key=lambda f: -f.probability))
+    output = (f for f in rows if f.probability > _LEAST)
+    return tuple(sorted(output, key=lambda f: -f.probability))

@@ -178,13 +178,13 @@ class Place:
 def place_of(model: Model, port: Port, sizes: Sizes) -> Place:
     """Return a port with what a formula at it may be of."""
     names = variables_at(model, port)[:_VARIABLES]
-    own = (port.variable,) if port.kind in ("output", "intermediate") else ()
+    item = (port.variable,) if port.kind in ("output", "intermediate") else ()
     return Place(
         port,
         names,
-        {n: true_sum(n) if n in own else n for n in (*names, *own)},
-        {n: sizes.signals[n] for n in (*names, *own)},
-        {n: port.unit if n in own else unit_of(model, n) for n in (*names, *own)},
+        {n: true_sum(n) if n in item else n for n in (*names, *item)},
+        {n: sizes.signals[n] for n in (*names, *item)},
+        {n: port.unit if n in item else unit_of(model, n) for n in (*names, *item)},
         size_at(port, sizes),
     )
 
@@ -242,8 +242,8 @@ def fitted(
         [*of.fit.unknowns.names, *component.fitted],
         sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
     )  # fmt: skip
-    found = hypothesis((*of.causes, component), fit, experiments)
-    return None if found is None else Formula(found, component, tuple(terms))
+    result = hypothesis((*of.causes, component), fit, experiments)
+    return None if result is None else Formula(result, component, tuple(terms))
 
 
 def formula(
@@ -255,7 +255,7 @@ def formula(
     It is looked for first along the course of the model with a free function there, which is near
     the truth's.
     """
-    found: list[Formula] = []
+    formulas: list[Formula] = []
     tried, now = set[frozenset[Term]](), free
 
     def score(f: Formula) -> float:
@@ -267,11 +267,11 @@ def formula(
                 terms = tuple(t for t, _, _ in chosen)
                 if frozenset(terms) not in tried:
                     tried.add(frozenset(terms))
-                    found += _both(of, now.hypothesis.fit, place, chosen, experiments)
-        if not found or (best := max(found, key=score)) is now:
+                    formulas += _both(of, now.hypothesis.fit, place, chosen, experiments)
+        if not formulas or (best := max(formulas, key=score)) is now:
             break
         now = best
-    return max(found, key=score, default=None)
+    return max(formulas, key=score, default=None)
 
 
 def _both(
@@ -292,8 +292,8 @@ def _both(
     promised = {n: float(np.clip(v, *bounds[n])) for n, v in promised.items()}
     for start in (promised, nothing):
         with suppress(PsaError):
-            found = fitted(of, begin, component, terms, experiments, start)
-            return [] if found is None else [found]
+            result = fitted(of, begin, component, terms, experiments, start)
+            return [] if result is None else [result]
     return []
 
 
@@ -301,7 +301,7 @@ def _chosen(
     now: Formula, place: Place, experiments: Sequence[Experiment], price: float
 ) -> list[list[_Choice]]:
     """Return of every size the set of terms that explains most along the course of a model."""
-    fit, own = now.hypothesis.fit, {*now.component.fitted}
+    fit, item = now.hypothesis.fit, {*now.component.fitted}
     known = {(t, h): c for t, h, c in now.choices(fit.model.values)}
     library = [t for t in place.library() if not t.over]
     ratios = [t for t in place.library() if t.over]
@@ -313,16 +313,20 @@ def _chosen(
     sizes = np.array([effects[k].parameters[0].typical(fit.model.values) for k in at])
     first, further = zip(*(columns[effects[k].name] for k in at), strict=True)
     colour = now.hypothesis.colour
-    beside = [np.column_stack(part) for part in zip(*further, strict=True)]
-    white = colour.whiten_all(np.column_stack(first), beside)
+    items = [np.column_stack(part) for part in zip(*further, strict=True)]
+    white = colour.whiten_all(np.column_stack(first), items)
     factors = np.array([known.get(trials[k], 0.0) for k in at])
     target = whitened_residuals(fit, colour) + white @ (factors / sizes)
-    kept = [n not in own for n in fit.unknowns.names]
+    kept = [n not in item for n in fit.unknowns.names]
     kept += [True] * (fit.unknowns.size - len(kept))
     basis = independent(whitened_jacobian(fit, colour)[:, kept])
     left, target = without(white, basis), without(target, basis)
-    told = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
-    left, at, sizes = left[:, told], [k for k, q in zip(at, told, strict=True) if q], sizes[told]
+    output = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
+    left, at, sizes = (
+        left[:, output],
+        [k for k, q in zip(at, output, strict=True) if q],
+        sizes[output],
+    )
     return [
         [(*trials[at[k]], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
         for rows, gains in _best_subsets(left, target, [trials[k][0] for k in at], price)
@@ -340,7 +344,7 @@ def _best_subsets(
     unit, n, total = columns / norms, len(target), float(target @ target)
     gram, along = unit.T @ unit + 1e-9 * np.eye(len(norms)), unit.T @ target
     costs = (price + np.log(len(norms))) * np.array([t.parameters for t in terms])
-    found = []
+    items = []
     for count in range(1, min(_TERMS, len(norms)) + 1):
         sets = np.array([*combinations(range(len(norms)), count)])
         g, b = gram[sets[:, :, None], sets[:, None, :]], along[sets]
@@ -350,5 +354,5 @@ def _best_subsets(
         scores[[len({terms[j] for j in one}) < count for one in sets]] = -np.inf
         k = int(np.argmax(scores))
         if scores[k] > 0.0:
-            found.append((sets[k].tolist(), gains[k] / norms[sets[k]]))
-    return found
+            items.append((sets[k].tolist(), gains[k] / norms[sets[k]]))
+    return items

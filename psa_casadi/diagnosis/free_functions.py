@@ -57,9 +57,9 @@ def model_of(
     """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    sure, given = determinacy(fit, experiments), [e.record for e in experiments]
+    sure, inputs = determinacy(fit, experiments), [e.record for e in experiments]
     return with_told(
-        model.with_values(values), given, sure.names, sure.intervals, force_scale="given",
+        model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
     )  # fmt: skip
 
@@ -81,57 +81,62 @@ def fit_free_functions(
             with suppress(PsaError):
                 scored.append((_decrease(view, component, experiments), place, component))
     scored.sort(key=lambda s: -s[0])
-    found = []
+    items = []
     for _, place, component in scored[:_FITTED]:
         task.progress(f"a free function in {place.port.words}")
         with suppress(PsaError):
             free = fitted(of, of.fit, component, place.polynomial(), experiments)
             if free is not None:
-                found.append(_told(free, of, place, task, base, effects, scale))
-    return sorted(found, key=lambda f: -f.evidence)
+                items.append(_told(free, of, place, task, base, effects, scale))
+    return sorted(items, key=lambda f: -f.evidence)
 
 
 def formula_of(
-    told: FreeFunction, of: Hypothesis, task: Task, base: Model, effects: Sequence[Attached],
-    scale: Scale, whole: Sequence[Experiment],
-) -> FreeFunction | None:  # fmt: skip
+    free_function: FreeFunction,
+    of: Hypothesis,
+    task: Task,
+    base: Model,
+    effects: Sequence[Attached],
+    scale: Scale,
+    whole: Sequence[Experiment],
+) -> FreeFunction | None:
     """Return the formula in the place of a free function; None where it predicts less.
 
     Its numbers are those of the `whole` records where the model with it follows these.
     """
-    port = next(p for p in ports_of(base) if p.words == told.port)
+    port = next(p for p in ports_of(base) if p.words == free_function.port)
     place = place_of(base, port, _sizes(base, of, task.experiments))
     task.progress(f"a formula in {port.words}")
-    found = formula(of, told.fitted, place, task.experiments, scale, task.limits.price)
-    if found is None:
+    result = formula(of, free_function.fitted, place, task.experiments, scale, task.limits.price)
+    if result is None:
         return None
-    rows = zip(found.hypothesis.errors, told.held, strict=True)
+    rows = zip(result.hypothesis.errors, free_function.held, strict=True)
     if any(error > _AS_WELL * before for error, before in rows):
         return None
-    own = _told(found, of, place, task, base, effects, scale)
+    item = _told(result, of, place, task, base, effects, scale)
     if len(whole) < len(task.experiments):
         with suppress(PsaError):
-            fit = begun(found.hypothesis.fit, task.experiments, whole)
+            fit = begun(result.hypothesis.fit, task.experiments, whole)
             if follows(fit, whole):
-                added = [*effects, Attached(found.component, port)]
-                own = replace(own, model=model_of(base, fit, added, whole))
+                added = [*effects, Attached(result.component, port)]
+                item = replace(item, model=model_of(base, fit, added, whole))
     return replace(
-        own,
-        equation=found.equation(port.balance, own.model.values),
-        parameters=estimates(found.component, own.model),
+        item,
+        equation=result.equation(port.balance, item.model.values),
+        parameters=estimates(result.component, item.model),
     )
 
 
 def _told(
-    found: Formula, of: Hypothesis, place: Place, task: Task, base: Model,
+    result: Formula, of: Hypothesis, place: Place, task: Task, base: Model,
     effects: Sequence[Attached], scale: Scale,
 ) -> FreeFunction:  # fmt: skip
     """Return a fitted function, and what it adds beside the variable that it follows most."""
-    h, port, experiments = found.hypothesis, place.port, task.experiments
+    h, port, experiments = result.hypothesis, place.port, task.experiments
     s = h.fit.model.structure
-    term = found.component.equations(Symbols(s.symbols)).add[port.balance]
-    seen = [s.symbols[place.symbols[n]] for n in place.names]
-    *rows, added = _along(h.fit, experiments, [*seen, term])
+    term = result.component.equations(Symbols(s.symbols)).add[port.balance]
+    items = [s.symbols[place.symbols[n]] for n in place.names]
+    *rows, added = _along(h.fit, experiments, [*items, term])
     values = dict(zip(place.names, rows, strict=True))
 
     def scatter(name: str) -> float:
@@ -148,15 +153,15 @@ def _told(
         held=h.errors,
         predicted=h.shown,
         of=" and ".join(
-            n for n in place.names if any(n in (*t.factors, t.over) for t in found.terms)
+            n for n in place.names if any(n in (*t.factors, t.over) for t in result.terms)
         ),
         unit=port.unit,
         variable=name,
         variable_unit=place.units[name],
         along=values[name],
         added=added,
-        model=model_of(base, h.fit, [*effects, Attached(found.component, port)], experiments),
-        fitted=found,
+        model=model_of(base, h.fit, [*effects, Attached(result.component, port)], experiments),
+        fitted=result,
     )
 
 
@@ -164,15 +169,15 @@ def _along(
     fit: Fit, experiments: Sequence[Experiment], expressions: Sequence[Expression]
 ) -> FloatArray:
     """Return expressions in a model's symbols along all records (expressions, n)."""
-    model, theta, found = fit.model, fit.placed(experiments), []
+    model, theta, result = fit.model, fit.placed(experiments), []
     s, p = model.structure, model.parameter_vector()
     sums = ca.vertcat(*(s.symbols[n] for n in s.sums)), ca.vertcat(*s.sums.values())
     f = ca.Function("along", s.arguments, [ca.substitute(ca.vertcat(*expressions), *sums)])
     for r, e in enumerate(experiments):
         x = states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)
         time, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
-        found.append(np.array(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))))
-    return np.hstack(found)
+        result.append(np.array(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))))
+    return np.hstack(result)
 
 
 def _sizes(base: Model, of: Hypothesis, experiments: Sequence[Experiment]) -> Sizes:

@@ -37,12 +37,12 @@ def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, IndexArray]:
     output is not judged. The parts are the records that have any, where there are at least four,
     else eight blocks of each.
     """
-    rows = [own for own in zip(*errors, strict=True) if len(own[0])]
+    rows = [item for item in zip(*errors, strict=True) if len(item[0])]
     if len(rows) < FEWEST_RECORDS:
         rows = [
             block
-            for own in rows
-            for block in zip(*(np.array_split(e, _BLOCKS) for e in own), strict=True)
+            for item in rows
+            for block in zip(*(np.array_split(e, _BLOCKS) for e in item), strict=True)
             if len(block[0])
         ]
     outputs = errors[0][0].shape[1]
@@ -119,9 +119,9 @@ def held_out_gain(
     unit.
     """
     gained = 0.0
-    for n, own, *rest in zip(samples, colour.each, straight, before, after, strict=True):
+    for n, item, *rest in zip(samples, colour.each, straight, before, after, strict=True):
         old, new = (max(float(np.hypot(e, rest[0])), 1e-300) for e in rest[1:])
-        gained += n / own.inflation * float(np.log(old / new))
+        gained += n / item.inflation * float(np.log(old / new))
     return gained
 
 
@@ -160,7 +160,7 @@ def held_out_parts(
     The parts are those of `psa_casadi.diagnosis.held_out`.
     """
     each = [held_out_residuals(experiments, p) for p in predicted]
-    sums, counts = parts_of(*([r[:, None] for r in own] for own in each))
+    sums, counts = parts_of(*([r[:, None] for r in item] for item in each))
     return sums[:, :, 0], counts[:, 0]
 
 
@@ -236,10 +236,10 @@ class Share:
         while digits < 2 and share < 1.0 and float(f"{100 * share:.{digits}f}") >= 100.0:
             digits += 1
         least = 10.0**-digits
-        told = f"{100 * share:.{digits}f}"
+        text = f"{100 * share:.{digits}f}"
         if 0.0 < 100 * share < 0.5 * least:
-            told = f"under {least:.{digits}f}"
-        return told, f"{100 * low:.{digits}f}", f"{100 * high:.{digits}f}"
+            text = f"under {least:.{digits}f}"
+        return text, f"{100 * low:.{digits}f}", f"{100 * high:.{digits}f}"
 
     @property
     def text(self) -> str:
@@ -297,8 +297,8 @@ class Removed:
 
 def _powers(sums: FloatArray, counts: IndexArray) -> FloatArray:
     """Return the mean squares (models, outputs) over parts, 0 for an output without a sample."""
-    found: FloatArray = np.sum(sums, axis=0) / np.maximum(np.sum(counts, axis=0), 1)
-    return found
+    values: FloatArray = np.sum(sums, axis=0) / np.maximum(np.sum(counts, axis=0), 1)
+    return values
 
 
 @dataclass(frozen=True)
@@ -340,12 +340,12 @@ def removed_from(
     """
     judged = [counted(experiments, j) for j in range(len(noise))]
 
-    def errors(shown: Sequence[FloatArray]) -> list[FloatArray]:
+    def errors(arrays: Sequence[FloatArray]) -> list[FloatArray]:
         """Return the errors (n, channels) where any channel is judged, else nan."""
         parts = []
-        for e, y, *own in zip(experiments, shown, *judged, strict=True):
-            which, each = np.column_stack(own), y.reshape(len(y), -1).T
-            left = np.column_stack([e.errors(j, each[j]) for j in range(len(own))])
+        for e, y, *item in zip(experiments, arrays, *judged, strict=True):
+            which, each = np.column_stack(item), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(item))])
             parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
         return parts
 
@@ -371,7 +371,7 @@ def budget(
 
 
 def stack_budget(
-    found: Budget,
+    result: Budget,
     experiments: Sequence[Experiment],
     base: Sequence[FloatArray],
     extended: Sequence[FloatArray],
@@ -382,9 +382,9 @@ def stack_budget(
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     whole = errors_of(experiments, extended)
     return StackBudget(
-        found.together,
-        found.causes,
-        found.unnamed,
+        result.together,
+        result.causes,
+        result.unnamed,
         excess_rms_m=excess,
         noise_rms_m=noise,
         remains_rms_m=remains,

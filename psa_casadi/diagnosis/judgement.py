@@ -131,10 +131,10 @@ class Judge:
             test, beyond = step.test, self.unseen(step)
             p = test.p_value if beyond is None else min(test.p_value, beyond[1])
             if test.alarm:
-                found = Remaining(False, p, test.finding)
+                remaining = Remaining(False, p, test.finding)
             else:
-                found = Remaining(True, p) if beyond is None else Remaining(False, p, beyond[0])
-            self._left[step] = found
+                remaining = Remaining(True, p) if beyond is None else Remaining(False, p, beyond[0])
+            self._left[step] = remaining
         return self._left[step]
 
     def _shown(self, evidence: float) -> Shown:
@@ -154,7 +154,7 @@ class Judge:
 
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
-        found = self.corrections(before) if beside else ()
+        result = self.corrections(before) if beside else ()
         removed = removed_from(self.experiments, before.shown, self.noise)
         scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
@@ -167,7 +167,7 @@ class Judge:
             evidence=scale.evidence(after) - scale.evidence(before),
             share=removed.from_base(after.shown),
             each=each,
-            corrections=found,
+            corrections=result,
             limits=self.limits,
         )
 
@@ -180,23 +180,25 @@ class Judge:
     @cached_property
     def each(self) -> dict[str, Weighed]:
         """Every cause by itself, against corrections of the model without it, all others kept."""
-        last, found = self.last.view.of, {}
+        last, weigheds = self.last.view.of, {}
         for s in self.steps if self.doubt is None else ():
             if s.chosen is not None and s.without is not None:
                 if s.without.fit is self.first.fit:
-                    found[s.cause.name] = self.weighed
+                    weigheds[s.cause.name] = self.weighed
                     continue
-                own = self.weigh(s.without, last)
-                found[s.cause.name] = replace(own, corrections=self._instead(own.corrections))
-        return found
+                weighed = self.weigh(s.without, last)
+                weigheds[s.cause.name] = replace(
+                    weighed, corrections=self._instead(weighed.corrections)
+                )
+        return weigheds
 
-    def _instead(self, found: Sequence[Correction]) -> list[Correction]:
+    def _instead(self, corrections: Sequence[Correction]) -> list[Correction]:
         """Return corrections with what they add in a cause's place alone.
 
         What they add beside all causes as well is no word against one of these.
         """
         more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
-        return [replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in found]
+        return [replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in corrections]
 
     @cached_property
     def _beside_last(self) -> Sequence[Correction]:
@@ -214,15 +216,15 @@ class Judge:
             of = self.families[name]
             if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):
                 others = {(f.place, f.kind) for f in of if f.not_listed > 0.0}
-                found = [c for c in weighed.corrections if place_and_kind(c) in others]
-                better[name] = max(found, key=lambda c: c.evidence)
+                items = [c for c in weighed.corrections if place_and_kind(c) in others]
+                better[name] = max(items, key=lambda c: c.evidence)
         return better
 
     @property
     def unnamed(self) -> set[str]:
         """Causes that are vague, or without which the model is as likely."""
         price = self.limits.price
-        return {*self.vague, *(n for n, own in self.each.items() if own.evidence <= price)}
+        return {*self.vague, *(n for n, item in self.each.items() if item.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -254,15 +256,15 @@ class Judge:
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
         unnamed = self.unnamed
-        found = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
+        items = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
         little = self.weighed.least[1] < self.least
         if not self.driven:
             return "not_driven"
         if not self.missing:
             return "adequate"
-        if self.doubt is not None or not found or little:
+        if self.doubt is not None or not items or little:
             return "unexplained"
-        if told_from(found[0], self.limits):
+        if told_from(items[0], self.limits):
             return "ambiguous"
         more = self.vague or not self.left(self.last).white
         return "partly_explained" if more else "cause_named"
@@ -341,7 +343,7 @@ class Judge:
     def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
         """Return a cause: its probability, the share of the error that it removes."""
         name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
-        own, of = shares.get(name), self.families.get(name, ())
+        item, of = shares.get(name), self.families.get(name, ())
         sure = sum(f.effects.get(name, 0.0) for f in of) if of else step.probability[name]
         return Cause(
             effect=name,
@@ -349,7 +351,7 @@ class Judge:
             confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
             cannot_be_told_from=told_from(step, self.limits),
-            explained_share=0.0 if own is None else own.shown[0],
+            explained_share=0.0 if item is None else item.shown[0],
             remedy=step.cause.what_now.code,
             sizes=tuple(sizes),
             port=port,
@@ -494,19 +496,19 @@ class ModelJudge(Judge):
         Without causes these leave noise of any colour, and the innovations are compared.
         """
         rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.own, strict=True)
-        for o, noise, own in rows:
+        for o, noise, item in rows:
             if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
-                found = held_out_within(own, len(step.fit.theta), self.limits)
-                if found:
-                    told = note("held_out_unlike", output=o.column, ratio=found.factor)
-                    return told, found.p_value
+                excess = held_out_within(item, len(step.fit.theta), self.limits)
+                if excess:
+                    output = note("held_out_unlike", output=o.column, ratio=excess.factor)
+                    return output, excess.p_value
                 continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
             rms = missed_rms(self.experiments, step.view.of.shown, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
             if held and rms > least:
-                told = note("held_out_unlike", output=o.column, ratio=rms / noise)
-                return told, step.test.p_value
+                output = note("held_out_unlike", output=o.column, ratio=rms / noise)
+                return output, step.test.p_value
         return None
 
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
@@ -549,8 +551,10 @@ class ModelJudge(Judge):
         if times < _CANCEL or size is None or both is None:
             return ()
         alone, together = (size.value, size.unit), (both.value, both.unit)
-        said = note("cancel", effect=effect, output=size.output, alone=alone, together=together)
-        return (said,)
+        statement = note(
+            "cancel", effect=effect, output=size.output, alone=alone, together=together
+        )
+        return (statement,)
 
     def _left_out(self) -> tuple[Note, ...]:
         """Return which causes are clearly likelier than the best, but may only correct its form.

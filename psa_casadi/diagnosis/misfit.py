@@ -217,11 +217,11 @@ def harmonic_split(record: Record, residual: FloatArray) -> HarmonicSplit | None
         "odd": harmonic & ~excited & (order // base % 2 == 1),
     }
     line, between = _powers(_filled(e), periods)
-    found = {name: _significant(line[c], between[c], periods) for name, c in classes.items()}
+    table = {name: _significant(line[c], between[c], periods) for name, c in classes.items()}
     total = float(np.sum(line[1:])) + float(np.sum(between[1:])) * (periods - 1)
-    noise = max(total - sum(found.values()), 0.0)
+    noise = max(total - sum(table.values()), 0.0)
     first = float(record.time[run.start + run.lag] - record.time[run.start])
-    return HarmonicSplit(base / first, periods, int(excited.sum()), **found, noise=noise)
+    return HarmonicSplit(base / first, periods, int(excited.sum()), **table, noise=noise)
 
 
 def _excited(amplitude: FloatArray) -> BoolArray:
@@ -346,14 +346,14 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     power = float(np.mean(ground.residual**2))
     excess = max(0.0, 1.0 - floor.level**2 / power) if power > 0 else 0.0
     rms, mean, unit = float(np.sqrt(power)), float(np.nanmean(residual)), record.displacement_unit
-    said = [(v.share, _followed(v, unit)) for v in views if v.significant]
+    items = [(v.share, _followed(v, unit)) for v in views if v.significant]
     if held is not None and held.significant:
-        said.append((held.share, _held(held, slope, count, unit)))
+        items.append((held.share, _held(held, slope, count, unit)))
     lines = tuple((n.frequency, n.name, (n.amplitude, unit)) for n in spectrum.others[:3])
-    told = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
-    said.append((spectrum.share, told))
-    worth = sorted((row for row in said if row[0] > WORTH_SAYING), key=lambda row: -row[0])
-    findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in worth)]
+    output = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
+    items.append((spectrum.share, output))
+    gain = sorted((row for row in items if row[0] > WORTH_SAYING), key=lambda row: -row[0])
+    findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in gain)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:
         findings.append(_split(split, unit))
     return Misfit(
@@ -379,15 +379,15 @@ def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None, i
     axis, count = hold_axis(record)
     if not count:
         return None, None, 0
-    found = view(ground, axis)
-    good = found.spread > 0
+    result = view(ground, axis)
+    good = result.spread > 0
     if np.count_nonzero(good) < 3:
-        return found, None, count
-    x, weight = np.log10(found.x[good]), found.spread[good] ** -2.0
+        return result, None, count
+    x, weight = np.log10(result.x[good]), result.spread[good] ** -2.0
     x = x - np.average(x, weights=weight)
     spread = float(np.sum(weight * x**2))
-    value = float(np.sum(weight * x * found.mean[good])) / spread
-    return found, Slope(value, 1.0 / float(np.sqrt(spread))), count
+    value = float(np.sum(weight * x * result.mean[good])) / spread
+    return result, Slope(value, 1.0 / float(np.sqrt(spread))), count
 
 
 def _size(record: Record, rms: float, mean: float, floor: NoiseFloor, excess: float) -> Note:

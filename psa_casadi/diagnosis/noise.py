@@ -89,10 +89,10 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     `residual` (n,) is smaller than what differs between repeats, the repeats hold more than noise:
     what a first loop leaves behind, and creep.
     """
-    source, found, _ = _source(record)
-    if found is None or source != "repeats" or found.samples < _COLOUR:
+    source, result, _ = _source(record)
+    if result is None or source != "repeats" or result.samples < _COLOUR:
         return None
-    return found.autoregression if found.level <= rms(residual) else None
+    return result.autoregression if result.level <= rms(residual) else None
 
 
 def knowable(
@@ -125,28 +125,36 @@ def knowable_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds)
 
 def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
     quantum, _, _ = _resolution(record)
-    source, found, how = _source(record)
-    if found is not None and found.level > rms(valid):
-        source, found, how = _FAST_PART
-    if found is None:
+    source, measured_noise, how = _source(record)
+    if measured_noise is not None and measured_noise.level > rms(valid):
+        source, measured_noise, how = _FAST_PART
+    if measured_noise is None:
         level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
         covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
-        found = MeasuredNoise(level, covariance, np.array([r] if r > 0 else []), valid.size)
+        measured_noise = MeasuredNoise(
+            level, covariance, np.array([r] if r > 0 else []), valid.size
+        )
     rounding = _rounding(quantum)
-    level, covariance = found.level, found.autocovariance.copy()
+    level, covariance = measured_noise.level, measured_noise.autocovariance.copy()
     if level < rounding:
         covariance[0] += rounding**2 - level**2
         level = rounding
     unit = record.displacement_unit
     finding = note(
-        "noise", record=record.name, level=(level, unit), how=how, samples=found.samples,
+        "noise", record=record.name, level=(level, unit), how=how, samples=measured_noise.samples,
         quantum=None if quantum is None else (quantum, unit),
         rounding=(rounding, unit),
     )  # fmt: skip
     return NoiseFloor(
-        record.name, level, source, found.samples, covariance, found.autoregression, quantum,
+        record.name,
+        level,
+        source,
+        measured_noise.samples,
+        covariance,
+        measured_noise.autoregression,
+        quantum,
         finding,
-    )  # fmt: skip
+    )
 
 
 def _rounding(quantum: float | None) -> float:

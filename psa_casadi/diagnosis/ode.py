@@ -89,17 +89,17 @@ def diagnose_ode(
     be simulated at its values, DiagnosisInterrupted with the best model so far at a keyboard
     interrupt once there is one.
     """
-    given, held = _given(model, records, holdout, hold)
+    inputs, held = _given(model, records, holdout, hold)
     shifted = known_zeros(model, zeros)
 
     def made(length: int | None) -> tuple[Experiment, ...]:
-        parts = cut(model, given, length), cut(model, held, length)
+        parts = cut(model, inputs, length), cut(model, held, length)
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
-    for base, runs, _, told in ways(
+    for base, runs, _, output in ways(
         model,
-        given,
+        inputs,
         made,
         free_of(model, free),
         undecided=not known_hold,
@@ -109,14 +109,14 @@ def diagnose_ode(
         if base.interrupted:
             raise KeyboardInterrupt
         table = _table(base, runs, effects, leave_out, of_zeros)
-        way = _Way(base, runs, told, table, made, known_hold, progress, watch, [base])
+        way = _Way(base, runs, output, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
         if _settled(judge):
             break
     with way.kept_at_interrupt():
         answer = judge.conclude()
-    noise = noise_found(answer.extended_fit, answer.experiments, (*given, *held))
+    noise = noise_found(answer.extended_fit, answer.experiments, (*inputs, *held))
     codes = {n.code for n in notes}
     remarks = (
         *(n for n in way.said if n.code not in codes),
@@ -130,14 +130,14 @@ def diagnose_ode(
 
 def _entering(of: Hypothesis) -> tuple[Note, ...]:
     """Return where noise enters a model, as far as it does not come from its sensors."""
-    rows = [(f.column, own) for f, own in zip(of.fit.channels, of.own, strict=True)]
+    rows = [(f.column, item) for f, item in zip(of.fit.channels, of.own, strict=True)]
     return tuple(
         note(
             "noise_enters", output=column, place=w.place, rate=w.rate, rms=(w.rms, w.unit),
-            time=w.time, nats=own.gained,
+            time=w.time, nats=item.gained,
         )
-        for column, own in rows
-        if (w := own.entering) is not None
+        for column, item in rows
+        if (w := item.entering) is not None
     )  # fmt: skip
 
 
@@ -151,9 +151,9 @@ def _given(
         raise InputError(
             f"The model '{model.name}' has effects already ({names}); diagnose it without them."
         )
-    given = given_to(model, records, hold)
+    signals = given_to(model, records, hold)
     none = isinstance(holdout, tuple | list) and not holdout
-    return given, [] if none else given_to(model, holdout, hold, len(given) + 1)
+    return signals, [] if none else given_to(model, holdout, hold, len(signals) + 1)
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,10 @@ class _Way:
     watch: Callable[[Tried], None]
     so_far: list[Fit]
 
-    def searched(self, own: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
+    def searched(self, texts: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
         """Return the judge of what is found; parameters may change where the rest leaves much."""
         fixed = [
-            n for n, e in self.table.items() if n in own or e.component.kind != "changing gain"
+            n for n, e in self.table.items() if n in texts or e.component.kind != "changing gain"
         ]
         judge, notes, first = self._judged(fixed)
         if len(fixed) < len(self.table) and (judge.verdict in _OPEN or _coloured(judge)):
@@ -245,8 +245,8 @@ def _settled(judge: ModelJudge) -> bool:
 
 def _coloured(judge: ModelJudge) -> bool:
     """Whether a base that lacks nothing leaves noise that is not white."""
-    own = judge.first.view.of.own
-    return judge.verdict == "adequate" and any(c.autoregression.size for c in own)
+    item = judge.first.view.of.own
+    return judge.verdict == "adequate" and any(c.autoregression.size for c in item)
 
 
 _Tasks = Callable[[tuple[Experiment, ...]], Task]
@@ -271,9 +271,9 @@ def _search(
 def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Known:
     ports = {*ports_of(base.model), *parameter_ports(base.model)}
     task = task_of(experiments)
-    found = best_first(replace(base, model=with_ports(base.model, ports)), task)
-    task.keep(found.answer.fit)
-    return found
+    known = best_first(replace(base, model=with_ports(base.model, ports)), task)
+    task.keep(known.answer.fit)
+    return known
 
 
 def _held_instead(
@@ -292,14 +292,14 @@ def _held_instead(
         return None
     others = held_as(runs, hold)
     try:
-        found = _once(refitted(base, others), others, task_of)
+        result = _once(refitted(base, others), others, task_of)
     except PsaError:
         return None
-    nats, more = likelier(found.answer.fit, best.fit), len(found.answer.causes) - len(best.causes)
-    as_much = late and more < 0 and found.answer.fit.rms < _AS_MUCH * best.fit.rms
+    nats, more = likelier(result.answer.fit, best.fit), len(result.answer.causes) - len(best.causes)
+    as_much = late and more < 0 and result.answer.fit.rms < _AS_MUCH * best.fit.rms
     if not as_much and nats < LIKELIER * (1 + more):
         return None
-    return found, (note("hold_found", hold=hold, nats=max(nats, 0.0)),)
+    return result, (note("hold_found", hold=hold, nats=max(nats, 0.0)),)
 
 
 def _late(base: Fit) -> set[str]:
@@ -318,15 +318,15 @@ def _of_whole(known: Known, task: Task) -> Known | None:
         if not best.causes or not follows(top, task.experiments):
             return None
         base = begun(known.root.fit, parts, task.experiments)
-        found = Known(levelled(base, task.experiments)[0], task)
+        result = Known(levelled(base, task.experiments)[0], task)
         for h in (h for h in known.found.values() if h.causes and h.final):
             with suppress(PsaError):
                 fit = top if h is best else begun(h.fit, parts, task.experiments)
-                found.note(hypothesis(h.causes, fit, task.experiments, final=True))
-        found.conclude()
+                result.note(hypothesis(h.causes, fit, task.experiments, final=True))
+        result.conclude()
     except PsaError:
         return None
-    return found
+    return result
 
 
 def _table(

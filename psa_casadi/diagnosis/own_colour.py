@@ -103,12 +103,12 @@ def own_colour(
     error = np.concatenate(errors)
     used, held = (np.concatenate(rows).astype(np.bool_) for rows in (fitted, judged))
     runs = tuple(stop - start for rows in fitted for start, stop in runs_of(rows))
-    at, begins, most = windows(fitted)
+    at, starts, most = windows(fitted)
     columns = np.zeros((len(error), jacobian.shape[1]))
     columns[used] = jacobian
     rate, first = np.concatenate(rates), used.copy()
     first[at] = False  # no innovation is known of these: they count over the noise's rms
-    begun = columns[first]
+    started = columns[first]
     fixed = np.where(used | held, error, 0.0)
     known = np.isfinite(prior)
     weight = np.where(known, 1.0 / np.where(known, prior, 1.0) ** 2, 0.0)
@@ -123,27 +123,29 @@ def own_colour(
             new = new / spread[at]
             learnt, ahead = (
                 _innovations(fixed, k, a) / spread[k]
-                for k in (at, _ends(used | held, begins, a.size, held))
+                for k in (at, _ends(used | held, starts, a.size, held))
             )
-            found = OwnColour(
+            result = OwnColour(
                 a, rms(new), len(at), left[used], runs, learnt, ahead,
                 spread[used] if lost else None, lost,
             )  # fmt: skip
-            if found.nats() <= reached:
+            if result.nats() <= reached:
                 return
-            reached = found.nats()
-            yield found, left
+            reached = result.nats()
+            yield result, left
             if not a.size and not lost:
                 return  # the fit is the likeliest one already
             white = _innovations(columns, at, a) / spread[at, None]
-            share = (found.level / max(rms(left[used]), 1e-300)) ** 2
-            normal = white.T @ white + share * begun.T @ begun + np.diag(found.level**2 * weight)
-            along = white.T @ new + share * begun.T @ left[first]
+            share = (result.level / max(rms(left[used]), 1e-300)) ** 2
+            normal = (
+                white.T @ white + share * started.T @ started + np.diag(result.level**2 * weight)
+            )
+            along = white.T @ new + share * started.T @ left[first]
             left = left - columns @ np.linalg.lstsq(normal, along, rcond=1e-12)[0]
 
     *_, even = follow(fixed, uneven=False)
     *_, jittering = follow(even[1], uneven=True)
-    return max(even, jittering, key=lambda found: found[0].nats())[0]
+    return max(even, jittering, key=lambda result: result[0].nats())[0]
 
 
 def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
@@ -152,12 +154,12 @@ def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
     And where the records begin, and that order, the highest one that so many windows can tell.
     """
     used = np.concatenate(fitted).astype(np.bool_)
-    begins = np.cumsum([0, *(len(rows) for rows in fitted[:-1])])
+    starts = np.cumsum([0, *(len(rows) for rows in fitted[:-1])])
     for most in _ORDERS[::-1]:
-        at = _ends(used, begins, most)
+        at = _ends(used, starts, most)
         if len(at) >= _EACH * most:
             break
-    return at, begins, most
+    return at, starts, most
 
 
 def price_of(order: int, samples: int) -> float:
@@ -188,14 +190,14 @@ def _autoregression(left: FloatArray, at: IndexArray, most: int) -> FloatArray:
     """Return the best autoregression of windows that end at some samples."""
     rows = left[at[:, None] - np.arange(most + 1)]
     n, products = len(rows), rows.T @ rows
-    found: list[tuple[float, FloatArray]] = [(-np.inf, np.zeros(0))]
+    result: list[tuple[float, FloatArray]] = [(-np.inf, np.zeros(0))]
     for p in (p for p in _ORDERS if p <= most and n and products[0, 0] > 0):
         past, along = products[1 : p + 1, 1 : p + 1], products[1 : p + 1, 0]
         a = np.linalg.lstsq(past, along, rcond=1e-12)[0]
         level = float(np.sqrt(max(float(products[0, 0] - along @ a), 0.0) / n))
         if not _rings(a):
-            found.append((_nats(n, level, p), a))
-    return max(found, key=lambda row: row[0])[1]
+            result.append((_nats(n, level, p), a))
+    return max(result, key=lambda row: row[0])[1]
 
 
 def _rings(a: FloatArray) -> bool:
@@ -208,18 +210,18 @@ def _rings(a: FloatArray) -> bool:
 
 def _innovations(signal: FloatArray, at: IndexArray, a: FloatArray) -> FloatArray:
     """Return what an autoregression leaves of a signal (samples,) or columns at some samples."""
-    found: FloatArray = signal[at].copy()
+    values: FloatArray = signal[at].copy()
     for k, share in enumerate(a, 1):
-        found -= share * signal[at - k]
-    return found
+        values -= share * signal[at - k]
+    return values
 
 
 def _ends(
-    there: BoolArray, begins: IndexArray, most: int, ends: BoolArray | None = None
+    there: BoolArray, indices: IndexArray, most: int, ends: BoolArray | None = None
 ) -> IndexArray:
     """Return the samples, of some `ends`, with so many before them without a gap in one record."""
     index = np.arange(len(there))
     first = there & ~np.concatenate([[False], there[:-1]])
-    first[begins[begins < len(there)]] = True
+    first[indices[indices < len(there)]] = True
     since = index - np.maximum.accumulate(np.where(first, index, 0))
     return np.flatnonzero((there if ends is None else ends) & (since >= most))

@@ -72,15 +72,15 @@ class Pack:
                 inputs.append(record_inputs(fit.model, e.record, e.record.n)[at])
             moving = [column for column in np.vstack(inputs).T if np.ptp(column) > 0]
             for along in moving or [np.zeros(len(left))]:
-                found = omnibus(
+                result = omnibus(
                     left, along, np.concatenate(time), noise, noise_rms(f.residuals, noise),
                     lengths=f.lengths, knowable=f.straight, own=own, alarms_below=limits.alarm,
                 )  # fmt: skip
-                rows.append(replace(found, output=f.column if fit.further else ""))
+                rows.append(replace(result, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
         worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
-        told = worst.p_value * len(rows)
-        return replace(worst, p_value=min(1.0, told if worst.alarm else p))
+        output = worst.p_value * len(rows)
+        return replace(worst, p_value=min(1.0, output if worst.alarm else p))
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
         """Return whether what a direction promises to remove can be told of the device."""
@@ -103,17 +103,17 @@ class Pack:
         return True
 
     def entering(
-        self, fit: Fit, experiments: Sequence[Experiment], shown: Sequence[FloatArray],
-        own: tuple[OwnColour, ...],
+        self, fit: Fit, experiments: Sequence[Experiment], arrays: Sequence[FloatArray],
+        item: tuple[OwnColour, ...],
     ) -> tuple[OwnColour, ...]:  # fmt: skip
         """Return the noise of every channel, where it enters the model if that is likelier."""
         return tuple(
             entering(
                 fit, experiments,
-                [e.errors(f.number, y[:, k]) for e, y in zip(experiments, shown, strict=True)],
+                [e.errors(f.number, y[:, k]) for e, y in zip(experiments, arrays, strict=True)],
                 k, colour,
             )
-            for k, (f, colour) in enumerate(zip(fit.channels, own, strict=True))
+            for k, (f, colour) in enumerate(zip(fit.channels, item, strict=True))
         )  # fmt: skip
 
     def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
@@ -164,16 +164,18 @@ class StackPack(Pack):
                 alarms_below=limits.alarm,
             )  # fmt: skip
 
-        first, *beside = residuals
+        first, *others = residuals
         test = test_of(first, experiments, colour, knowable_of(fit, experiments, limits))
-        for f, left, of in zip(fit.further, beside, colour.further, strict=True):
+        for f, left, of in zip(fit.further, others, colour.further, strict=True):
             if test.alarm:
                 break
-            found = test_of(left, [experiments[k] for k in f.records], of, f.straight)
-            p = min(1.0, found.p_value * (1 + len(fit.further)))
-            if found.alarm and p < limits.alarm:
+            result = test_of(left, [experiments[k] for k in f.records], of, f.straight)
+            p = min(1.0, result.p_value * (1 + len(fit.further)))
+            if result.alarm and p < limits.alarm:
                 size = max(test.size, 2.0 * test.knowable)
-                test = replace(found, p_value=p, size=size, knowable=test.knowable, output=f.column)
+                test = replace(
+                    result, p_value=p, size=size, knowable=test.knowable, output=f.column
+                )
         return test
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
@@ -225,11 +227,11 @@ class StackPack(Pack):
         return float(static @ static) < limits.static * float(target @ target)
 
     def entering(
-        self, fit: Fit, experiments: Sequence[Experiment], shown: Sequence[FloatArray],
-        own: tuple[OwnColour, ...],
+        self, fit: Fit, experiments: Sequence[Experiment], arrays: Sequence[FloatArray],
+        item: tuple[OwnColour, ...],
     ) -> tuple[OwnColour, ...]:  # fmt: skip
         """Return the noise as it is: that of any colour is the sensor's."""
-        return own
+        return item
 
     def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
         """Return the fit as it is: levels of columns are those of the base."""

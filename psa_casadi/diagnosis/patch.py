@@ -46,13 +46,13 @@ def with_patch(
             evaluations=POLISH,
         )
 
-    found = []
+    items = []
     for theta in (before.theta + patch.moved, before.theta):
         with suppress(SimulationError):
-            found.append(begun(theta))
-    if not found:
+            items.append(begun(theta))
+    if not items:
         raise SimulationError("The model cannot be simulated with the unnamed correction.")
-    return min(found, key=lambda f: f.cost)
+    return min(items, key=lambda f: f.cost)
 
 
 def _numbers(

@@ -111,12 +111,12 @@ def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     edges = np.arange(_SIDE, _BINS - _SIDE + 1)
     left, right = (below[edges + k] - below[edges + k - _SIDE] for k in (0, _SIDE))
     before, after = (sums[edges + k] - sums[edges + k - _SIDE] for k in (0, _SIDE))
-    seen = np.minimum(left, right) > 0
+    observed = np.minimum(left, right) > 0
     jump = after / np.maximum(right, 1) - before / np.maximum(left, 1)
-    power = np.where(seen, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
+    power = np.where(observed, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
     places = edges[highest_peaks(power, _SIDE, _PEAKS)]
-    found = low + span * np.sort(places) / _BINS
-    return tuple(float(x) for x in found)
+    result = low + span * np.sort(places) / _BINS
+    return tuple(float(x) for x in result)
 
 
 def _binned(
@@ -131,8 +131,8 @@ def _binned(
     for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
         if e.held_out_whole:
             continue
-        shown = measured(e.record)[: e.stop][e.used[: e.stop]]
-        parts.append((shown - residual - fit.offset(k), residual))
+        displayed = measured(e.record)[: e.stop][e.used[: e.stop]]
+        parts.append((displayed - residual - fit.offset(k), residual))
     x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))
     low, span = float(x.min()), float(np.ptp(x))
     places = (_BINS * (x - low) / max(span, 1e-300)).astype(np.int64)
@@ -199,14 +199,14 @@ def directions(
     fitted = [e.record for e in experiments if e.stop]
     laws = laws_of(fit.model, fitted, effects, finite_steps=finite_steps)
     compiled(screened_with(fit.model, effects, laws))
-    beside = _Beside(fit, experiments, laws)
+    others = _Beside(fit, experiments, laws)
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
         effect, values = task
         model = composed[effect.name].with_values(values)
-        return list(_directions_at(fit, experiments, effect, model, values, finite_steps, beside))
+        return list(_directions_at(fit, experiments, effect, model, values, finite_steps, others))
 
-    return [d for found in side_by_side(one, tasks) for d in found]
+    return [d for result in side_by_side(one, tasks) for d in result]
 
 
 def tangents(
@@ -227,13 +227,13 @@ def tangents(
         return {
             e.name: (columns[:, k], tuple(f[:, k] for f in further)) for k, e in enumerate(effects)
         }
-    beside, found = _Beside(fit, experiments, laws), {}
+    others, table = _Beside(fit, experiments, laws), {}
     for e, gain in zip(effects, gains, strict=True):
         model, moved = fit.model.with_effect(e), {gain: sizes[gain]}
-        columns, further, error = _changes(fit, experiments, model, moved, memory, 0.0, beside)
+        columns, further, error = _changes(fit, experiments, model, moved, memory, 0.0, others)
         if error < _ROUGH:
-            found[e.name] = columns[:, 0], tuple(f[:, 0] for f in further)
-    return found
+            table[e.name] = columns[:, 0], tuple(f[:, 0] for f in further)
+    return table
 
 
 def laws_of(
@@ -248,7 +248,7 @@ def laws_of(
     Of records on even times with straight lines between the samples alone; of effects that are
     looked for with finite gains those that read nothing of what they move.
     """
-    found = {}
+    table = {}
     with suppress(NotExact):
         for r in records:
             time_steps(r.time)
@@ -256,8 +256,8 @@ def laws_of(
             law = law_of(model.with_effect(e).structure, e)
             steps = finite_steps and any(e.finite_step)
             if law is not None and (law.forward or not steps):
-                found[e.name] = law
-    return found
+                table[e.name] = law
+    return table
 
 
 def screened_with(
@@ -342,7 +342,7 @@ def _directions_at(
     model: Model,
     values: dict[str, float],
     finite_steps: bool,
-    beside: _Beside,
+    alongside: _Beside,
 ) -> Iterator[Direction]:
     gain = effect.gain or ""
     parameter = model.parameter(gain)
@@ -356,13 +356,13 @@ def _directions_at(
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
             try:
-                found = None
-                if effect.name in beside.laws:
+                result = None
+                if effect.name in alongside.laws:
                     columns, further, error = _changes(
-                        fit, experiments, model, moved, memory, step, beside
+                        fit, experiments, model, moved, memory, step, alongside
                     )
-                    found = (columns, further) if beside.tells(columns, error) else None
-                columns, further = found or changes(fit, experiments, model, moved, memory, step)
+                    result = (columns, further) if alongside.tells(columns, error) else None
+                columns, further = result or changes(fit, experiments, model, moved, memory, step)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
@@ -371,11 +371,11 @@ def _directions_at(
                 if not np.all(np.isfinite(every)) or not np.any(every):
                     continue
                 if effect.linear:
-                    weight, own, unit = name, {**values, name: size}, 1.0
+                    weight, item, unit = name, {**values, name: size}, 1.0
                 else:
-                    weight, own, unit = "", values, step or size
+                    weight, item, unit = "", values, step or size
                 yield Direction(
-                    effect, own, memory, unit, column, one_sided, bool(step), others, weight
+                    effect, item, memory, unit, column, one_sided, bool(step), others, weight
                 )
 
 
@@ -423,9 +423,9 @@ def _changes(
     moved: Mapping[str, float],
     memory: tuple[dict[str, float], ...],
     step: float,
-    beside: _Beside | None = None,
+    others: _Beside | None = None,
 ) -> tuple[FloatArray, tuple[FloatArray, ...], float]:
-    """Return the same with the share that they may err by, where `beside` has the effect's law."""
+    """Return the same with the share that they may err by, where `others` has the effect's law."""
     stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
@@ -435,14 +435,14 @@ def _changes(
         e, way = experiments[k], Way(rtol, rtol)
         if not e.stop:
             return Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
-        if beside is not None:
-            own = beside.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
-            return own if step else replace(own, y=own.y * sizes)
-        found = trace_record(
+        if others is not None:
+            item = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
+            return item if step else replace(item, y=item.y * sizes)
+        traced = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=way, by_start=False, outputs=outputs,
         )  # fmt: skip
-        return Answer(found.y[:, :, None] if step else found.sensitivity * sizes, 0.0)
+        return Answer(traced.y[:, :, None] if step else traced.sensitivity * sizes, 0.0)
 
     outputs = outputs_of(experiments[0].channels)
     every, columns = [changed(k) for k in range(len(experiments))], []
@@ -469,11 +469,11 @@ def _changes(
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:
     """Return the places of directions that belong together: those of a span, or single ones."""
-    found: dict[object, list[int]] = {}
+    table: dict[object, list[int]] = {}
     for k, d in enumerate(trials):
         others = tuple(v for n, v in d.values.items() if n not in d.effect.linear)
-        found.setdefault((d.effect.name, others) if d.weight else k, []).append(k)
-    return list(found.values())
+        table.setdefault((d.effect.name, others) if d.weight else k, []).append(k)
+    return list(table.values())
 
 
 def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
@@ -491,14 +491,14 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
         np.column_stack([d.column for d in directions]) @ gains,
         one_sided=False,
         finite=False,
-        further=tuple(np.column_stack(own) @ gains for own in every),
+        further=tuple(np.column_stack(item) @ gains for item in every),
     )
 
 
 def declared(directions: Sequence[Direction]) -> FloatArray:
     """Return the gains (m,) of a span's directions at the effect's declared weights."""
-    own = {p.name: p.value for p in directions[0].effect.parameters}
-    return np.array([own[d.weight] / d.values[d.weight] for d in directions])
+    table = {p.name: p.value for p in directions[0].effect.parameters}
+    return np.array([table[d.weight] / d.values[d.weight] for d in directions])
 
 
 @dataclass(frozen=True, eq=False)
@@ -517,20 +517,20 @@ class Span:
     @cached_property
     def information(self) -> FloatArray:
         """W'W (m, m)."""
-        found: FloatArray = self.norms[:, None] * self.gram * self.norms
-        return found
+        values: FloatArray = self.norms[:, None] * self.gram * self.norms
+        return values
 
     @cached_property
     def covariance(self) -> FloatArray:
         """That of the weights (m, m), with their prior."""
         weighted = self.information + np.eye(len(self.norms)) / LINEAR_PRIOR**2
-        found: FloatArray = np.linalg.inv(weighted).astype(np.float64)
-        return found
+        values: FloatArray = np.linalg.inv(weighted).astype(np.float64)
+        return values
 
     def gains(self, t: FloatArray) -> FloatArray:
         """Return the weights (..., m), in ordinary sizes, that fit best."""
-        found: FloatArray = (t * self.norms) @ self.covariance
-        return found
+        values: FloatArray = (t * self.norms) @ self.covariance
+        return values
 
     def decrease(self, t: FloatArray) -> FloatArray:
         """Return D (...), less what noise makes of more weights than one, at least 0.
@@ -538,8 +538,8 @@ class Span:
         Compared with the threshold for single directions, noise passes it as rarely.
         """
         removed = np.sum(self.gains(t) * t * self.norms, axis=-1)
-        found: FloatArray = np.maximum(removed - self.surplus, 0.0).astype(np.float64)
-        return found
+        values: FloatArray = np.maximum(removed - self.surplus, 0.0).astype(np.float64)
+        return values
 
     @cached_property
     def surplus(self) -> float:
@@ -555,8 +555,8 @@ class Span:
     def penalties(self) -> FloatArray:
         """What the evidence loses by each combination of the weights (m,), rising."""
         values = np.linalg.eigvalsh(self.information)
-        found: FloatArray = 0.5 * np.log1p(LINEAR_PRIOR**2 * np.maximum(values, 0.0))
-        return found
+        result: FloatArray = 0.5 * np.log1p(LINEAR_PRIOR**2 * np.maximum(values, 0.0))
+        return result
 
     def detectable(self, gains: FloatArray) -> float:
         """Return the multiple of these weights (m,) that is as large as the noise."""

@@ -75,16 +75,16 @@ class _Noises:
 
 def entering(
     fit: Fit, experiments: Sequence[Experiment], errors: Sequence[FloatArray], k: int,
-    own: OwnColour,
+    item: OwnColour,
 ) -> OwnColour:  # fmt: skip
     """Return the noise of channel k with a place where it enters, if that is likelier.
 
-    `errors` (n,) are those of the experiments, over the noise's shares; `own` is the colour that
+    `errors` (n,) are those of the experiments, over the noise's shares; `item` is the colour that
     they have by themselves. It is returned as it is where it is white, where nothing is likelier,
     and where the model has no linear form in CasADi's elementary operations.
     """
-    if not own.autoregression.size or fit.model.structure.sampled or fit.model.structure.foreign:
-        return own
+    if not item.autoregression.size or fit.model.structure.sampled or fit.model.structure.foreign:
+        return item
     number = fit.channels[k].number
     used = [e.at(number) for e in experiments]
     columns = fit.channels[k].jacobian[:, : 0 if fit.further else None]
@@ -97,33 +97,33 @@ def entering(
             )
         ]
     except (PsaError, KeyError, np.linalg.LinAlgError):
-        return own
+        return item
     prior, (at, _, _) = fit.unknowns.prior[: columns.shape[1]], windows(used)
     states = len(fit.model.state_names) - sum(len(c.states) for c in fit.model.effects)
     tried = _tried(parts[0], len(fit.model.input_names) + states)
-    few, seen = _first(parts, used)
+    few, observed = _first(parts, used)
     if not tried.place.size or not few:
-        return own
-    chosen = _found(few, seen, tried, prior).nats(np.flatnonzero(np.concatenate(seen)))
+        return item
+    chosen = _found(few, observed, tried, prior).nats(np.flatnonzero(np.concatenate(observed)))
     tried = tried.beside(int(np.argmax(chosen)))
-    found = _found(parts, used, tried, prior)
-    best = int(np.argmax(found.nats(at)))
-    gained = float(found.nats(at)[best]) - price_of(_ORDER, len(at)) - own.nats()
+    result = _found(parts, used, tried, prior)
+    best = int(np.argmax(result.nats(at)))
+    gained = float(result.nats(at)[best]) - price_of(_ORDER, len(at)) - item.nats()
     if not gained > _LIKELIER:
-        return own
-    one, level = tried.only(best), rms(found.white[at, best])
+        return item
+    one, level = tried.only(best), rms(result.white[at, best])
     held = [e.at(number, e.held_out) for e in experiments]
     ahead = np.concatenate(
         [_filtered(p, a | b, one)[0][:, 0, 0] for p, a, b in zip(parts, used, held, strict=True)]
     )
     rows = np.concatenate([p.rows[at] for p, at in zip(parts, used, strict=True)])
     return replace(
-        own, entering=_told(fit.model, parts, one, level), gained=gained, learnt=ahead[at],
+        item, entering=_told(fit.model, parts, one, level), gained=gained, learnt=ahead[at],
         ahead=ahead[np.concatenate(held)],
         entered=(
-            rows[:, 0] - rows[:, 1:] @ found.moves[best],
+            rows[:, 0] - rows[:, 1:] @ result.moves[best],
             _Entered(
-                (np.zeros(0),) * len(own.runs), level, own.runs,
+                (np.zeros(0),) * len(item.runs), level, item.runs,
                 parts=tuple(parts), used=tuple(used), noise=one,
             ),
         ),
@@ -140,14 +140,14 @@ class _Entered(Colour):
 
     def whiten(self, signal: FloatArray) -> FloatArray:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
-        columns, first, found = signal.reshape(len(signal), -1), 0, []
+        columns, first, result = signal.reshape(len(signal), -1), 0, []
         for p, at in zip(self.parts, self.used, strict=True):
             count = int(np.count_nonzero(at))
             rows = np.zeros((len(at), columns.shape[1]))
             rows[at] = columns[first : first + count]
-            found.append(_filtered(replace(p, rows=rows), at, self.noise)[0][at, 0])
+            result.append(_filtered(replace(p, rows=rows), at, self.noise)[0][at, 0])
             first += count
-        return np.concatenate(found).reshape(signal.shape)
+        return np.concatenate(result).reshape(signal.shape)
 
 
 def _rows(error: FloatArray, used: BoolArray, columns: FloatArray) -> FloatArray:
@@ -214,16 +214,16 @@ def _found(
 ) -> _Found:
     """Filter the used samples of all records; linearly, the parameters follow the noise."""
     filtered = [_filtered(p, at, noises) for p, at in zip(parts, used, strict=True)]
-    rows, spread = (np.concatenate(found) for found in zip(*filtered, strict=True))
+    rows, spread = (np.concatenate(result) for result in zip(*filtered, strict=True))
     at = np.concatenate(used)
     white, columns = rows[:, :, 0], rows[:, :, 1:]
     known = np.isfinite(prior)
     weight = np.where(known, 1.0 / np.where(known, prior, 1.0) ** 2, 0.0)
     moves = np.zeros((white.shape[1], len(prior)))
     for b in range(len(moves)):
-        own = columns[at, b]
-        normal = own.T @ own + np.mean(white[at, b] ** 2) * np.diag(weight)
-        moves[b] = np.linalg.lstsq(normal, own.T @ white[at, b], rcond=1e-12)[0]
+        item = columns[at, b]
+        normal = item.T @ item + np.mean(white[at, b] ** 2) * np.diag(weight)
+        moves[b] = np.linalg.lstsq(normal, item.T @ white[at, b], rcond=1e-12)[0]
         white[:, b] -= columns[:, b] @ moves[b]
     return _Found(white, spread, moves)
 
@@ -267,7 +267,7 @@ def _first(
     parts: Sequence[_Linear], used: Sequence[BoolArray]
 ) -> tuple[list[_Linear], list[BoolArray]]:
     """Return the first samples of records, as many as choose."""
-    left, few, seen = _CHOOSING, [], []
+    left, few, observed = _CHOOSING, [], []
     for p, at in zip(parts, used, strict=True):
         n = min(len(at), left)
         if n < 2 or not at[:n].any():
@@ -276,9 +276,9 @@ def _first(
             p, phi=p.phi[: n - 1], before=p.before[: n - 1], after=p.after[: n - 1],
             c=p.c[:n], rows=p.rows[:n],
         ))  # fmt: skip
-        seen.append(at[:n])
+        observed.append(at[:n])
         left -= n
-    return few, seen
+    return few, observed
 
 
 def _tried(of: _Linear, count: int) -> _Noises:

@@ -106,15 +106,15 @@ class Healthy:
         And the number of places at which such a voltage was played before.
         """
         each = self._forms(records)
-        columns = [np.hstack(own) for own in zip(*each, strict=True)]
-        which = np.repeat(np.arange(len(each)), [own[0].shape[1] for own in each])
-        seen = [np.isfinite(r) for r in self.residuals]
-        rows = np.vstack([c[s] for c, s in zip(columns, seen, strict=False)])
-        target = np.concatenate([r[s] for r, s in zip(self.residuals, seen, strict=True)])
+        columns = [np.hstack(item) for item in zip(*each, strict=True)]
+        which = np.repeat(np.arange(len(each)), [item[0].shape[1] for item in each])
+        items = [np.isfinite(r) for r in self.residuals]
+        rows = np.vstack([c[s] for c, s in zip(columns, items, strict=False)])
+        target = np.concatenate([r[s] for r, s in zip(self.residuals, items, strict=True)])
         weights = _ridge(rows, target, which)
-        told = [c @ weights for c in columns[len(self.experiments) :]]
-        found = [self._again(r, own) for r, own in zip(records, told, strict=True)]
-        return [own for own, _ in found], min(n for _, n in found)
+        output = [c @ weights for c in columns[len(self.experiments) :]]
+        result = [self._again(r, item) for r, item in zip(records, output, strict=True)]
+        return [item for item, _ in result], min(n for _, n in result)
 
     def _forms(self, records: Sequence[Record]) -> list[list[FloatArray]]:
         """Return the columns (n, k) of every form, along the healthy records and further ones."""
@@ -123,15 +123,15 @@ class Healthy:
         signals = Signals(every, [e.record.voltage for e in every], responses(self.fit, every))
         shortest = min(r.duration for r in plain)
         settled = time_constants([e.record for e in every]) < shortest / _SETTLES
-        found = []
+        items = []
         for kind in (k for k in KINDS if (k.name, k.port) in _FORMS):
             parts = [kind.columns(signals, k)[r.n :] for k, r in enumerate(plain)]
             if kind.name == "relaxation":
                 parts = [p[:, settled] for p in parts]
             largest = np.std(np.vstack(parts[: len(self.experiments)]), axis=0)
             scale = kind.shape(parts[0].shape[1]) / max(float(largest.max(initial=0.0)), 1e-300)
-            found.append([(p - p.mean(axis=0)) * scale for p in parts])
-        return found
+            items.append([(p - p.mean(axis=0)) * scale for p in parts])
+        return items
 
     def shows(self, record: Record) -> BoolArray:
         """Return where a record's voltage is as it was in the healthy ones before (n,).
@@ -143,23 +143,23 @@ class Healthy:
         apart, _ = cKDTree(old).query(_place(record, span), p=np.inf, distance_upper_bound=_NEAR)
         return np.isfinite(apart)
 
-    def _again(self, record: Record, told: FloatArray) -> tuple[FloatArray, int]:
+    def _again(self, record: Record, values: FloatArray) -> tuple[FloatArray, int]:
         """Return the mean of what is left wherever the voltage of a record was played before (n,).
 
-        What is `told` without, where it was not; and the number of places.
+        What is `values` without, where it was not; and the number of places.
         """
         total, count, places = np.zeros(record.n), np.zeros(record.n), 0
-        for e, own in zip(self.experiments, self.residuals, strict=True):
+        for e, item in zip(self.experiments, self.residuals, strict=True):
             if abs(e.record.sample_time / record.sample_time - 1.0) > _STEP:
                 continue
             for lag in _lags(record.voltage, e.record.voltage):
                 first, last = max(0, -lag), min(record.n, e.record.n - lag)
-                apart = own[first + lag : last + lag] - told[first:last]
+                apart = item[first + lag : last + lag] - values[first:last]
                 there = np.isfinite(apart)
                 total[first:last] += np.where(there, apart - np.nanmean(apart), 0.0)
                 count[first:last] += there
                 places += 1
-        return told + total / np.maximum(count, 1.0), places
+        return values + total / np.maximum(count, 1.0), places
 
     @cached_property
     @stage("reference")
@@ -182,13 +182,13 @@ class Healthy:
 
     def _unlike(self, part: Record, others: tuple[Experiment, ...]) -> float:
         """Return the power [m^2] beyond the noise of what others do not predict of a record."""
-        own = fit(
+        item = fit(
             self.fit.model, others, self.fit.unknowns.names,
             sigma=noise_levels(others), evaluations=_EVALUATIONS,
         )  # fmt: skip
-        (rest,), _ = Healthy(own, others).since([part]).taken_off(1)
+        (rest,), _ = Healthy(item, others).since([part]).taken_off(1)
         new = [whole(rest)]
-        left = fit(own.model, new, (), sigma=noise_levels(new)).residuals
+        left = fit(item.model, new, (), sigma=noise_levels(new)).residuals
         (floor,) = noise_floor([rest], [left])
         return float(np.mean(left**2)) - floor.level**2
 
@@ -198,15 +198,16 @@ class Healthy:
         Raises InputError where hardly a new sample is like a healthy one.
         """
         added, places = self.adds(records)
-        shown = tuple(self.shows(r) for r in records)
-        for r, seen in zip(records, shown, strict=True):
-            if np.mean(seen) < _LEAST:
+        displayed = tuple(self.shows(r) for r in records)
+        for r, observed in zip(records, displayed, strict=True):
+            if np.mean(observed) < _LEAST:
                 raise InputError(
                     f"{r.name}: the voltage is as in the reference, in value, rate and last"
-                    f" reversals, for {np.mean(seen):.0%} of the samples; what has changed cannot"
-                    " be told from the rest. Record the device with the voltage of the reference."
+                    f" reversals, for {np.mean(observed):.0%} of the samples; what has changed"
+                    " cannot be told from the rest. Record the device with the voltage of the"
+                    " reference."
                 )
-        return Since(self, tuple(records), tuple(added), shown, places)
+        return Since(self, tuple(records), tuple(added), displayed, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,10 +227,10 @@ class Since:
     def taken_off(self, first: int) -> tuple[tuple[Record, ...], tuple[Record, ...]]:
         """Return the new records without it, the first so many and the others."""
         rows = zip(self.records, self.added, self.shown, strict=True)
-        found = tuple(
+        result = tuple(
             replace(r, displacement=np.where(s, measured(r) - a, np.nan)) for r, a, s in rows
         )
-        return found[:first], found[first:]
+        return result[:first], result[first:]
 
     @property
     def open(self) -> float:
@@ -262,19 +263,19 @@ class Since:
         less beside the noise than they do, and a stiffness where it leaves as little; what it
         leaves is its form. Another that leaves as little is told beside them.
         """
-        found, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
-        noise, base, least = found.noise_floor_rms_m, found.base_fit, self.open**2
+        result, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
+        noise, base, least = result.noise_floor_rms_m, result.base_fit, self.open**2
         excess = base.rms**2 - noise**2
-        if excess < least and found.verdict not in _NOTHING:
-            found = diagnosed(self.deaf(method, self.open), ())
-        said = [
+        if excess < least and result.verdict not in _NOTHING:
+            result = diagnosed(self.deaf(method, self.open), ())
+        items = [
             note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
                  shown=float(np.mean(np.concatenate(self.shown))))
         ]  # fmt: skip
-        best = None if found.verdict in _NOTHING else self._moved(found)
+        best = None if result.verdict in _NOTHING else self._moved(result)
         if best is not None:
             (name,) = best.unknowns.names
-            left, theirs = (f.rms**2 - noise**2 for f in (best, found.extended_fit))
+            left, theirs = (f.rms**2 - noise**2 for f in (best, result.extended_fit))
             form = (_FORM * noise) ** 2
             as_good = left < max(theirs, 0.0) + form
             alone = left < _CLEARLY * theirs and theirs > least + form
@@ -282,28 +283,28 @@ class Since:
             if left < max(_REST * excess, least + form) and (alone or as_good):
                 if alone:
                     deaf = self.deaf(method, float(np.hypot(best.rms, self.open)))
-                    found = diagnosed(deaf, (name,))
+                    result = diagnosed(deaf, (name,))
                 unit = base.model.parameter(name).unit
                 values = (base.model.values[name], best.model.values[name])
-                said.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
-        return replace(found, remarks=(*said, *found.remarks))
+                items.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
+        return replace(result, remarks=(*items, *result.remarks))
 
-    def _moved(self, found: StackDiagnosis) -> Fit | None:
+    def _moved(self, stack_diagnosis: StackDiagnosis) -> Fit | None:
         """Fit every parameter of the base alone; return the fit that leaves least.
 
         The stiffness, which is a gain of slow records, comes first of those that leave as little.
         """
-        fits, base = [], found.base_fit
+        fits, base = [], stack_diagnosis.base_fit
         for name in dict.fromkeys((*self.healthy.fit.unknowns.names, *_SCALES)):
             if name in base.model.values:
                 with suppress(PsaError):
                     fits.append(
-                        fit(base.model, found.experiments, (name,), sigma=base.sigma,
+                        fit(base.model, stack_diagnosis.experiments, (name,), sigma=base.sigma,
                             start_states=base.starts(), evaluations=_EVALUATIONS)
                     )  # fmt: skip
         best = min((f.rms for f in fits), default=0.0)
-        alike = (f for f in fits if f.rms < _ALIKE * best)
-        return min(alike, key=lambda f: (f.unknowns.names[0] not in _SCALES, f.rms), default=None)
+        similar = (f for f in fits if f.rms < _ALIKE * best)
+        return min(similar, key=lambda f: (f.unknowns.names[0] not in _SCALES, f.rms), default=None)
 
 
 def _place(record: Record, span: float) -> FloatArray:
@@ -318,8 +319,8 @@ def _place(record: Record, span: float) -> FloatArray:
     last, before, then = (twice.voltage[turns[np.maximum(after - j, 0)]] for j in (1, 2, 0))
     lasts = twice.time[turns[after]] - twice.time[turns[after - 1]]
     rate = np.abs(then - last) / np.maximum(lasts, record.sample_time)
-    told = _NEAR * np.log(np.maximum(rate, 1e-9 * span)) / np.log(4.0)
-    return np.column_stack([twice.voltage[k] / span, last / span, before / span, told])
+    output = _NEAR * np.log(np.maximum(rate, 1e-9 * span)) / np.log(4.0)
+    return np.column_stack([twice.voltage[k] / span, last / span, before / span, output])
 
 
 def _twice(record: Record) -> Experiment:
@@ -347,10 +348,10 @@ def _ridge(columns: FloatArray, target: FloatArray, which: npt.NDArray[np.intege
 
     def solved(sizes: FloatArray, g: FloatArray, c: FloatArray) -> FloatArray:
         on = np.flatnonzero(sizes[which])
-        s, found = noise * sizes[which][on], np.zeros(size)
+        s, values = noise * sizes[which][on], np.zeros(size)
         matrix = s[:, None] * g[np.ix_(on, on)] * s + noise**2 * np.eye(s.size)
-        found[on] = s * np.linalg.solve(matrix, s * c[on])
-        return found
+        values[on] = s * np.linalg.solve(matrix, s * c[on])
+        return values
 
     def missed(sizes: FloatArray) -> float:
         left = 0.0

@@ -80,13 +80,19 @@ def drive_of(model: Model, effect: Component, records: Sequence[Record]) -> Driv
         x0 = None if run is None else _state(model, run.start)
         plays.append((r.time, record_inputs(model, r, r.n), x0))
     if known is not None and known.seen.rate > 0:
-        seen = known.seen
+        observed = known.seen
         if not plays and known.reference is not None:
-            found, run = known.reference, known.run_of(known.reference.record)
-            inputs = {n: np.array(v) for n, v in found.inputs.items() if n in model.input_names}
+            result, run = known.reference, known.run_of(known.reference.record)
+            inputs = {n: np.array(v) for n, v in result.inputs.items() if n in model.input_names}
             x0 = None if run is None else _state(model, run.start)
-            plays = [(np.array(found.time), input_samples(model, len(found.time), inputs), x0)]
-        return Drive(seen.voltage.low, seen.voltage.high, seen.rate, seen.duration, tuple(plays))
+            plays = [(np.array(result.time), input_samples(model, len(result.time), inputs), x0)]
+        return Drive(
+            observed.voltage.low,
+            observed.voltage.high,
+            observed.rate,
+            observed.duration,
+            tuple(plays),
+        )
     high = model.values["u_rated"] / (model.values["G"] or 1.0)
     time, voltage = standard_voltage(_PERIOD, high)
     inputs = {"voltage": voltage}
@@ -106,8 +112,8 @@ def _state(model: Model, start: Mapping[str, float]) -> FloatArray:
 
 def _shown(model: Model, t: FloatArray, u: FloatArray, x0: FloatArray | None = None) -> FloatArray:
     """Return what a model shows (n,), from rest if no start is given."""
-    begun = start_on(model, t, u).x if x0 is None else x0
-    steps, _ = accurate(model, t, u, begun, rtol=_RTOL, hold="linear")
+    started = start_on(model, t, u).x if x0 is None else x0
+    steps, _ = accurate(model, t, u, started, rtol=_RTOL, hold="linear")
     y: FloatArray = steps.y[:, model.output_names.index(output_of(model) or "displacement")]
     return y
 
@@ -174,15 +180,15 @@ def _resonance(on: Model, off: Model, drive: Drive) -> list[Figure]:
     poles = np.linalg.eigvals(with_it.a)
     ringing = np.unique(np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]))
     near = np.geomspace(0.9, 1.1, _SAMPLES + 1)  # the peak lies beside the pole
-    found = []
+    items = []
     for natural in ringing.tolist():
         omega = natural * near
         ratio = np.abs(with_it.response(omega) / without.response(omega))
         best = int(np.argmax(np.abs(np.log(ratio))))
         if abs(float(np.log(ratio[best]))) > _TOLD:
             at = float(omega[best]) / (2.0 * np.pi)
-            found.append(Figure("resonance", float(ratio[best]), "1", at, "Hz"))
-    return sorted(found, key=lambda f: -abs(float(np.log(f.value))))[:_MOST]
+            items.append(Figure("resonance", float(ratio[best]), "1", at, "Hz"))
+    return sorted(items, key=lambda f: -abs(float(np.log(f.value))))[:_MOST]
 
 
 def _record(on: Model, off: Model, drive: Drive) -> list[Figure]:
@@ -250,18 +256,18 @@ def sizes(
     off = model.with_values({effect.gain or "": 0.0})
     test = TESTS[effect.what_now.test]
     try:
-        found = test(model, off, drive)
-        interval = _intervals(effect, model, found, lambda changed: test(changed, off, drive))
+        omnibus = test(model, off, drive)
+        interval = _intervals(effect, model, omnibus, lambda changed: test(changed, off, drive))
     except PsaError:
         return ()
-    if not np.isfinite([f.value for f in found]).all():
+    if not np.isfinite([f.value for f in omnibus]).all():
         return ()
     return tuple(
         Size(
             f.test, f.value, f.unit or unit, within, f.at, f.at_unit, (drive.low, drive.high),
             f.test == "hold" and f.at > drive.longest,
         )
-        for f, within in zip(found, interval, strict=True)
+        for f, within in zip(omnibus, interval, strict=True)
     )  # fmt: skip
 
 
@@ -269,17 +275,17 @@ def changes(
     effects: Sequence[Component],
     fit: Fit,
     experiments: Sequence[Experiment],
-    shown: Sequence[FloatArray],
+    arrays: Sequence[FloatArray],
 ) -> tuple[Size, ...]:
     """Return by how much effects of any model change each measured output within a record.
 
-    It is the range of the difference of two runs from the same start: `shown` (n, ny), the outputs
+    It is the range of the difference of two runs from the same start: `arrays` (n, ny), the outputs
     of the fit, and those with the effects' gains at 0; nothing where these cannot be simulated.
     """
     columns = [fit.model.output_names.index(o.channel.outputs[0]) for o in fit.channels]
     without = fit.at({e.gain: 0.0 for e in effects if e.gain})
     try:
-        pairs = zip(shown, without.outputs(experiments), strict=True)
+        pairs = zip(arrays, without.outputs(experiments), strict=True)
         most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)
     except PsaError:
         return ()
@@ -308,7 +314,7 @@ def example(effect: Component, stack: Model | None = None) -> tuple[Model, tuple
 def _intervals(
     effect: Component,
     model: Model,
-    found: Sequence[Figure],
+    figures: Sequence[Figure],
     test: Callable[[Model], Sequence[Figure]],
 ) -> list[tuple[float, float] | None]:
     """Return the 95 % intervals of figures.
@@ -318,20 +324,20 @@ def _intervals(
     """
     known = None if model.evidence is None else model.evidence.covariance.of(effect.fitted)
     if known is None or not known.names or effect.trial_starts:  # its starts share the gain's size
-        return [None] * len(found)
+        return [None] * len(figures)
     size, directions = np.linalg.eigh(np.array(known.matrix))
     moves = _NORMAL_95 * directions * np.sqrt(np.maximum(size, 0.0))
-    spread = np.zeros(len(found))
+    spread = np.zeros(len(figures))
     for move in moves.T:
         changed = {}
         for name, step in zip(known.names, move.tolist(), strict=True):
             bounds = model.parameter(name).bounds
             changed[name] = float(np.clip(model.values[name] + step, *bounds))
         other = test(model.with_values(changed))
-        if len(other) != len(found):
-            return [None] * len(found)
-        spread += [(o.value - f.value) ** 2 for o, f in zip(other, found, strict=True)]
+        if len(other) != len(figures):
+            return [None] * len(figures)
+        spread += [(o.value - f.value) ** 2 for o, f in zip(other, figures, strict=True)]
     return [
         (f.value - half if f.test in SIGNED else max(f.value - half, 0.0), f.value + half)
-        for f, half in zip(found, np.sqrt(spread).tolist(), strict=True)
+        for f, half in zip(figures, np.sqrt(spread).tolist(), strict=True)
     ]

@@ -227,18 +227,20 @@ class Diagnosis(Reported):
     families: tuple[Family, ...] = ()
     noise_kinds: tuple[NoiseFound, ...] = ()
 
-    def with_noise(self, noise: Sequence[NoiseFound], said: Sequence[Note | str]) -> Self:
-        """Return it with the noise that its extended model leaves, and what is `said` beside.
+    def with_noise(self, noise: Sequence[NoiseFound], statement: Sequence[Note | str]) -> Self:
+        """Return it with the noise that its extended model leaves, and what is `statement` beside.
 
         A reading that jumps a few times and stays there is no noise: nothing is `adequate` then.
         """
-        told = notes_of(noise)
-        jumps = [t for t in told if t.values["kind"] == "steps"]
-        found = replace(self, remarks=(*self.remarks, *said, *told), noise_kinds=tuple(noise))
+        notes = notes_of(noise)
+        jumps = [t for t in notes if t.values["kind"] == "steps"]
+        result = replace(
+            self, remarks=(*self.remarks, *statement, *notes), noise_kinds=tuple(noise)
+        )
         if not jumps or self.verdict != "adequate":
-            return found
+            return result
         left = Remaining(False, self.missed.p_value, jumps[0])
-        return replace(found, verdict="unexplained", missed=left, remaining=left)
+        return replace(result, verdict="unexplained", missed=left, remaining=left)
 
     @property
     def doubt(self) -> str:

@@ -111,12 +111,12 @@ def screen(
     if colour is None:
         every = independent(np.hstack([basis, without(columns, basis)]))
         colour = colour_of(without(fit.residuals, every), lengths, known, every)
-    beside = further_columns(fit, trials)
+    arrays = further_columns(fit, trials)
     if not colour.further:
-        colour = replace(colour, further=_further(fit, beside))
+        colour = replace(colour, further=_further(fit, arrays))
     white_basis = independent(whitened_jacobian(fit, colour))
     residual = without(whitened_residuals(fit, colour), white_basis)
-    whole = colour.whiten_all(columns, beside)
+    whole = colour.whiten_all(columns, arrays)
     white = without(whole, white_basis)
     raw = np.linalg.norm(whole, axis=0)
     norm = np.linalg.norm(white, axis=0)
@@ -124,17 +124,17 @@ def screen(
     norm = np.where(usable, norm, 1.0)
     unit = np.where(usable, white / norm, 0.0)
     t = unit.T @ residual / colour.level
-    scores, seen = [], []
+    scores, observed = [], []
     gram = unit.T @ unit
     for places in spans(trials):
-        own = [trials[k] for k in places]
-        if own[0].weight:
+        items = [trials[k] for k in places]
+        if items[0].weight:
             size = norm[places] * usable[places] / colour.level
             span = Span(gram[np.ix_(places, places)], size, limits.false_alarm)
-            seen.append((places, span))
-            scores.append(_of_span(own, span, t[places]))
+            observed.append((places, span))
+            scores.append(_of_span(items, span, t[places]))
             continue
-        k, direction = places[0], own[0]
+        k, direction = places[0], items[0]
         allowed = usable[k] and (t[k] > 0 or not direction.finite)
         scores.append(
             Score(
@@ -145,26 +145,26 @@ def screen(
             )
         )
     scores.sort(key=lambda s: -s.decrease)
-    return Screening(tuple(scores), _threshold(gram, seen, limits.false_alarm), colour)
+    return Screening(tuple(scores), _threshold(gram, observed, limits.false_alarm), colour)
 
 
-def _further(fit: Fit, beside: Sequence[FloatArray]) -> tuple[Colour, ...]:
+def _further(fit: Fit, arrays: Sequence[FloatArray]) -> tuple[Colour, ...]:
     """Return the colours of what neither fit nor directions explain of the further columns."""
-    found = []
-    for f, more in zip(fit.further, beside, strict=True):
+    items = []
+    for f, more in zip(fit.further, arrays, strict=True):
         fitted = independent(f.jacobian)
         every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
-        found.append(colour_of(without(f.residuals, every), f.lengths, None, every))
-    return tuple(found)
+        items.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    return tuple(items)
 
 
-def _of_span(own: Sequence[Direction], span: Span, t: FloatArray) -> Score:
+def _of_span(directions: Sequence[Direction], span: Span, t: FloatArray) -> Score:
     """Return the score of a span's best direction; `t` (m,) are the residual's projections."""
     return Score(
-        combined(own, span.gains(t)),
+        combined(directions, span.gains(t)),
         float(span.decrease(t)),
         1.0,
-        span.detectable(declared(own)),
+        span.detectable(declared(directions)),
         float(np.sum(span.penalties)) - 0.5 * span.surplus,
     )
 
@@ -215,10 +215,10 @@ def copies(
     basis = independent(colour.whiten(fit.jacobian))
     target = without(colour.whiten(added), basis)
     power = float(target @ target)
-    found: dict[str, Copy] = {}
+    result: dict[str, Copy] = {}
     for name in dict.fromkeys(d.effect.name for d in trials):
-        own = [d for d in trials if d.effect.name == name]
-        columns = np.column_stack([d.column for d in own])
+        items = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.column for d in items])
         free = without(colour.whiten(columns), basis)
         norms = np.linalg.norm(free, axis=0)
         usable = norms > 1e-6 * np.linalg.norm(columns, axis=0)
@@ -227,10 +227,10 @@ def copies(
         share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
         unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
         along = unit.T @ target / colour.level
-        ways = [_copy(own, p, unit, sizes / colour.level, along, limits) for p in spans(own)]
+        ways = [_copy(items, p, unit, sizes / colour.level, along, limits) for p in spans(items)]
         _, direction, gain = max(ways, key=lambda w: w[0])
-        found[name] = Copy(share, direction, gain)
-    return power / colour.level**2, found
+        result[name] = Copy(share, direction, gain)
+    return power / colour.level**2, result
 
 
 def _copy(
@@ -247,8 +247,8 @@ def _copy(
         t, norm = float(along[places[0]]), float(norms[places[0]])
         return t**2, first, t / max(norm, 1e-300) * first.unit_gain
     span = Span(unit[:, places].T @ unit[:, places], norms[places], limits.false_alarm)
-    own, t_own = [trials[k] for k in places], along[places]
-    return float(span.decrease(t_own)), combined(own, span.gains(t_own)), 1.0
+    item, t_own = [trials[k] for k in places], along[places]
+    return float(span.decrease(t_own)), combined(item, span.gains(t_own)), 1.0
 
 
 def independent(columns: FloatArray) -> FloatArray:
@@ -275,11 +275,11 @@ def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 def _threshold(
-    gram: FloatArray, seen: Sequence[tuple[list[int], Span]], false_alarm: float
+    gram: FloatArray, observed: Sequence[tuple[list[int], Span]], false_alarm: float
 ) -> float:
     """Quantile of the largest decrease that white noise makes along directions and spans.
 
-    `gram` is that of the unit directions, `seen` has the places of those that are in spans.
+    `gram` is that of the unit directions, `observed` has the places of those that are in spans.
     """
     if not len(gram):
         return np.inf
@@ -288,8 +288,8 @@ def _threshold(
     noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
     drawn = noise @ root.T
     single = np.ones(len(gram), dtype=bool)
-    single[[k for places, _ in seen for k in places]] = False
-    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in seen)]
+    single[[k for places, _ in observed for k in places]] = False
+    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in observed)]
     largest = np.max(every, axis=0)
     return float(np.quantile(largest, 1.0 - false_alarm))
 
@@ -325,30 +325,30 @@ def _ways(
     parameters can follow one. `costs` stand at the first place of a span: what the evidence loses
     by its weights but for the best told combination. A span that lacks a weight is left out.
     """
-    found: dict[str, list[list[int]]] = {}
+    table: dict[str, list[list[int]]] = {}
     weak, cost = np.full(len(trials), _NEW**2), np.zeros(len(trials))
     for places in spans(trials):
-        first, own = trials[places[0]], sizes[places]
+        first, item = trials[places[0]], sizes[places]
         if first.weight:
-            span = Span(gram[np.ix_(places, places)], own, limits.false_alarm)
-            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * own, _NEW) ** 2
+            span = Span(gram[np.ix_(places, places)], item, limits.false_alarm)
+            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * item, _NEW) ** 2
             cost[places[0]] = float(np.sum(span.penalties[:-1]))
-        if first.weight or own[0]:
-            found.setdefault(first.effect.name, []).append(places)
-    most = {name: max(map(len, own)) for name, own in found.items()}
-    whole = {n: [p for p in own if len(p) == most[n]] for n, own in found.items()}
-    return {n: np.array(own, dtype=np.int64) for n, own in whole.items()}, weak, cost
+        if first.weight or item[0]:
+            table.setdefault(first.effect.name, []).append(places)
+    most = {name: max(map(len, item)) for name, item in table.items()}
+    whole = {n: [p for p in item if len(p) == most[n]] for n, item in table.items()}
+    return {n: np.array(item, dtype=np.int64) for n, item in whole.items()}, weak, cost
 
 
 def _together(
     trials: Sequence[Direction],
-    own: Sequence[IndexArray],
+    indices: Sequence[IndexArray],
     places: IndexArray,
     multiples: FloatArray,
     promise: float,
 ) -> Together:
     """Return the directions at these places with their multiples, those of a span as one."""
-    ends = np.cumsum([p.shape[1] for p in own])[:-1]
+    ends = np.cumsum([p.shape[1] for p in indices])[:-1]
     directions, gains = [], []
     for of_one, sizes in zip(np.split(places, ends), np.split(multiples, ends), strict=True):
         these = [trials[int(k)] for k in of_one]
@@ -363,13 +363,13 @@ def best_sets(
     trials: Sequence[Direction],
     colour: Colour,
     size: int,
-    alike: Sequence[Sequence[str]] = (),
+    texts: Sequence[Sequence[str]] = (),
     limits: Thresholds = LIMITS,
 ) -> list[Together]:
     """Return the best directions of every set of so many effects, the best set first.
 
     The fitted parameters are free to follow. Gains have the sign that makes sense. Of sets that are
-    the same but for effects that are `alike` only the best one is returned.
+    the same but for effects that are `texts` only the best one is returned.
     """
     basis = independent(whitened_jacobian(fit, colour))
     residual = without(whitened_residuals(fit, colour), basis)
@@ -384,13 +384,13 @@ def best_sets(
     ways, weak, cost = _ways(trials, gram, norm * usable / colour.level, limits)
     gram += np.diag(weak)
     total, n = float(residual @ residual), len(residual)
-    found = []
+    items = []
     for names in combinations(ways, size):
-        if any(len(set(names) & set(group)) > 1 for group in alike):
+        if any(len(set(names) & set(group)) > 1 for group in texts):
             continue
-        own = [ways[name] for name in names]
-        grids = np.meshgrid(*(np.arange(len(p)) for p in own), indexing="ij")
-        index = np.hstack([p[g.ravel()] for p, g in zip(own, grids, strict=True)])
+        item = [ways[name] for name in names]
+        grids = np.meshgrid(*(np.arange(len(p)) for p in item), indexing="ij")
+        index = np.hstack([p[g.ravel()] for p, g in zip(item, grids, strict=True)])
         systems = gram[index[:, :, None], index[:, None, :]]
         gains = np.linalg.solve(systems, along[index][:, :, None])[:, :, 0]
         decrease = np.sum(gains * along[index], axis=1)
@@ -399,10 +399,10 @@ def best_sets(
         share = min(float(decrease[best]) / max(total, 1e-300), 1.0 - 1e-9)
         promise = -0.5 * n * float(np.log1p(-share)) - float(np.sum(cost[index[best]]))
         multiples = gains[best] / np.maximum(norm[index[best]], 1e-300)
-        found.append(_together(trials, own, index[best], multiples, promise))
-    heads = {n: group[0] for group in alike for n in group}
+        items.append(_together(trials, item, index[best], multiples, promise))
+    heads = {n: group[0] for group in texts for n in group}
     best_of: dict[frozenset[str], Together] = {}
-    for each in sorted(found, key=lambda t: -t.promise):
+    for each in sorted(items, key=lambda t: -t.promise):
         best_of.setdefault(frozenset(heads.get(n, n) for n in each.names), each)
     return list(best_of.values())
 
@@ -418,8 +418,8 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     gained += sum(further_gains(before, after, colour).values())
     levels = [_level(after.residuals, colour, 0.0)]
     levels += [
-        _level(f.residuals, own, f.straight)
-        for own, f in zip(colour.further, after.further, strict=True)
+        _level(f.residuals, item, f.straight)
+        for item, f in zip(colour.further, after.further, strict=True)
     ]
     return gained - occam(before, after, colour, levels)
 
@@ -430,7 +430,7 @@ def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> f
     `levels` are those of the noise in every channel.
     """
     rows = zip(colour.each, after.channels, levels, strict=True)
-    jacobian = np.concatenate([c.whiten(f.jacobian) / max(own, 1e-300) for c, f, own in rows])
+    jacobian = np.concatenate([c.whiten(f.jacobian) / max(item, 1e-300) for c, f, item in rows])
     known, other = before.unknowns, after.unknowns
     added = [k for k, n in enumerate(other.names) if n not in known.names]
     for record, states in enumerate(other.started):
@@ -448,8 +448,8 @@ def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:
     """Return what every further column adds to the log-likelihood of a fit over another one."""
     rows = zip(colour.further, before.further, after.further, strict=True)
     return {
-        new.column: _gained(old.residuals, new.residuals, own, new.straight)
-        for own, old, new in rows
+        new.column: _gained(old.residuals, new.residuals, item, new.straight)
+        for item, old, new in rows
     }
 
 
@@ -471,32 +471,32 @@ def estimated(before: Fit, screening: Screening) -> dict[str, float]:
     sigma: ln B = (n - k)/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged
     over the probe values, each as likely as the others.
     """
-    found: dict[str, list[float]] = {}
+    table: dict[str, list[float]] = {}
     white = whitened_residuals(before, screening.colour)
     total = float(np.sum(white**2))
     for score in screening.scores:
         share = min(score.decrease * screening.colour.level**2 / max(total, 1e-300), 1.0 - 1e-9)
         gained = -0.5 * (len(white) - before.unknowns.size) * float(np.log1p(-share))
-        found.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
-    return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in found.items()}
+        table.setdefault(score.direction.effect.name, []).append(_linear(score, gained))
+    return {name: float(np.logaddexp.reduce(v) - np.log(len(v))) for name, v in table.items()}
 
 
 def levelled(
     evidences: Mapping[str, float],
-    alike: Sequence[Sequence[str]],
+    texts: Sequence[Sequence[str]],
     judged: Collection[str] = (),
 ) -> dict[str, float]:
-    """Return the evidence with that of the best one for all effects that are `alike`.
+    """Return the evidence with that of the best one for all effects that are `texts`.
 
     They are the same but for a form that none of them is known to have. Where some of a group are
     `judged` by a full fit, the best one of those counts.
     """
-    found = dict(evidences)
-    for group in alike:
-        present = [n for n in group if n in found]
+    values = dict(evidences)
+    for group in texts:
+        present = [n for n in group if n in values]
         known = [n for n in present if n in judged] or present
-        found |= dict.fromkeys(present, max((found[n] for n in known), default=0.0))
-    return found
+        values |= dict.fromkeys(present, max((values[n] for n in known), default=0.0))
+    return values
 
 
 def temperature(largest: float, limits: Thresholds = LIMITS) -> float:
@@ -519,8 +519,8 @@ def probabilities(
     """
     if not evidences:
         return {}
-    given = np.array(list(evidences.values()))
-    values = given / temperature(max(whole, float(np.max(given))), limits)
+    inputs = np.array(list(evidences.values()))
+    values = inputs / temperature(max(whole, float(np.max(inputs))), limits)
     weights = np.exp(values - np.logaddexp.reduce(values))
     return dict(zip(evidences, weights.tolist(), strict=True))
 

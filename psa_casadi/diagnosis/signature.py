@@ -188,15 +188,15 @@ def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArr
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
         rows = [Axis("temperature", "K", play.warming)]
-    found = [_view(axis, d) for axis in rows]
+    items = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
         axis, _ = hold_axis(record)
-        found.append(_view(axis, _since_it_began(axis.x, d)))
+        items.append(_view(axis, _since_it_began(axis.x, d)))
 
     def told(row: tuple[View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
-    return max(found, key=told)
+    return max(items, key=told)
 
 
 def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
@@ -208,18 +208,18 @@ def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    seen = view(ground_of(residual, noise), axis)
+    observed = view(ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
-    if not seen.x.size:
-        return seen, coordinate, counted
-    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], seen.x))
-    left = counted[on] - np.interp(x, bins, seen.mean)
+    if not observed.x.size:
+        return observed, coordinate, counted
+    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], observed.x))
+    left = counted[on] - np.interp(x, bins, observed.mean)
     power = float(np.sum(d[there] ** 2))
-    beside = float(np.sum(d[there & ~on] ** 2))
-    share = 1.0 - (float(np.sum(left**2)) + beside) / power if power > 0 else 0.0
-    return replace(seen, share=max(0.0, share)), coordinate, counted
+    others = float(np.sum(d[there & ~on] ** 2))
+    share = 1.0 - (float(np.sum(left**2)) + others) / power if power > 0 else 0.0
+    return replace(observed, share=max(0.0, share)), coordinate, counted
 
 
 def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
@@ -242,8 +242,14 @@ def _spectrum(time: FloatArray, d: FloatArray) -> View:
     peak = float(frequency[np.argmax(power)])
     band = np.abs(frequency - peak) <= max(_BAND * peak, 2.0 * frequency[1])
     share = float(np.sum(power[band]) / np.sum(power))
-    shown = (frequency > 0) & (frequency < 20.0 * peak)
+    displayed = (frequency > 0) & (frequency < 20.0 * peak)
     density: FloatArray = np.sqrt(2.0 * step * power / float(window @ window))
     return View(
-        "spectrum", "Hz", frequency[shown], density[shown], np.zeros(int(shown.sum())), share, True
+        "spectrum",
+        "Hz",
+        frequency[displayed],
+        density[displayed],
+        np.zeros(int(displayed.sum())),
+        share,
+        True,
     )

@@ -98,20 +98,20 @@ _HOLD, _RATES, _SIZES = 3.0, 2, 3
 def next_experiment(
     causes: Sequence[Cause],
     verdict: Verdict,
-    alike: Sequence[Sequence[str]],
+    texts: Sequence[Sequence[str]],
     records: Sequence[Record],
     *,
     doubted: bool,
 ) -> NextExperiment:
-    """Return what to do next; `alike` are groups of effects that only a resonance tells apart."""
+    """Return what to do next; `texts` are groups of effects that only a resonance tells apart."""
     if verdict == "not_driven":
         return NextExperiment(None, (), (note("correct_columns"),))
     if doubted:
         return NextExperiment(None, (), (note("record_again"),))
     open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
-    rivals = tuple(dict.fromkeys(n for own in open_ones for n in own))
-    same = [own for own in open_ones if any(set(own) <= set(group) for group in alike)]
-    steps = [note("same_curve", effects=own) for own in same]
+    rivals = tuple(dict.fromkeys(n for item in open_ones for n in item))
+    same = [item for item in open_ones if any(set(item) <= set(group) for group in texts)]
+    steps = [note("same_curve", effects=item) for item in same]
     if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
         steps.append(useful_records(records))
     if steps:
@@ -135,7 +135,7 @@ def useful_records(records: Sequence[Record]) -> Note:
         "amplitudes": loop_sizes(records, span) >= _SIZES,
         "repeats": any(repeats(r) is not None for r in records),
     }
-    lacking = tuple(what for what, found in there.items() if not found)
+    lacking = tuple(what for what, result in there.items() if not result)
     return note("lacking", what=lacking) if lacking else note("other_conditions")
 
 
@@ -147,7 +147,7 @@ def alternatives(
     Of several such effects the likeliest that can be fitted and simulated.
     """
     effects, experiments = {e.name: e for e in task.table}, task.experiments
-    found = []
+    items = []
     for step in named:
         for name in sorted(
             told_from(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
@@ -162,11 +162,11 @@ def alternatives(
             except PsaError:
                 continue
             model = diagnosed_model(fitted.fit, experiments, fitted.predicted, stiffness_given)
-            found.append(
+            items.append(
                 Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
             )
             break
-    return tuple(found)
+    return tuple(items)
 
 
 def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:
@@ -205,9 +205,9 @@ def diagnosed_model(
     spent: StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
-    found = determinacy(fit, experiments)
-    told = replace(
-        evidence_of(fit, found, experiments, predicted, by="psa diagnose"),
+    result = determinacy(fit, experiments)
+    output = replace(
+        evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
         budget=None
         if spent is None
@@ -221,7 +221,7 @@ def diagnosed_model(
         ),
     )
     records = [e.record for e in experiments]
-    return with_provenance(fit.model, found, records, stiffness_given, evidence=told)
+    return with_provenance(fit.model, result, records, stiffness_given, evidence=output)
 
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:
@@ -304,11 +304,11 @@ class StackJudge(Judge):
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
-        found = held_out_excess(
+        excess = held_out_excess(
             step.fit, self.experiments, step.predicted, step.view.of.own[0], self.floors,
             self.limits,
         )  # fmt: skip
-        return (note("held_out_error", factor=found.factor), found.p_value) if found else None
+        return (note("held_out_error", factor=excess.factor), excess.p_value) if excess else None
 
     def named(self, step: Step) -> Cause:
         """Return a cause with what it changes in the tests that its effect declares."""
@@ -321,20 +321,20 @@ class StackJudge(Judge):
         """Return the diagnosis."""
         experiments, final, limits = self.experiments, self.final, self.limits
         both = self.first.predicted, final.predicted
-        missed = _misfits(experiments, self.missed_errors, self.floors)
+        misfits = _misfits(experiments, self.missed_errors, self.floors)
         records = [e.record for e in experiments]
-        alike = same_curves(experiments, self.task.table, self.first.fit)
+        texts = same_curves(experiments, self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
         base, extended = (errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
-        shown = OutputError("displacement", records[0].displacement_unit, self.floor, *rms)
+        output_error = OutputError("displacement", records[0].displacement_unit, self.floor, *rms)
         held = (s.view.of.held[1:] for s in (self.first, final))
         further = zip(final.fit.further, final.screening.colour.further, *held, strict=True)
         common = self.common | {"budget": self.spent}
         return StackDiagnosis(
             **common,
             errors=(
-                shown,
+                output_error,
                 *(OutputError(f.column, f.channel.unit, c.rms, *e) for f, c, *e in further),
             ),
             noise_floor_rms_m=self.floor,
@@ -343,15 +343,15 @@ class StackJudge(Judge):
             gain=gain_of(experiments, *both),
             blind_to=blind_spots(self.steps, final, self.task.table, limits),
             next_experiment=next_experiment(
-                self.causes, self.verdict, alike, records, doubted=self.doubt is not None
+                self.causes, self.verdict, texts, records, doubted=self.doubt is not None
             ),
             remarks=(*self.model.provenance.notes, *self.said, *coverage_notes(experiments)),
             experiments=tuple(experiments),
             base=both[0],
             extended=both[1],
             noise=self.floors,
-            misfit=missed,
-            remainder=_misfits(experiments, self.errors, self.floors) if self.kept else missed,
+            misfit=misfits,
+            remainder=_misfits(experiments, self.errors, self.floors) if self.kept else misfits,
             contenders=contenders(self.first, experiments, limits) if ambiguous else (),
             alternatives=alternatives(
                 self.kept, final.fit, self.task, stiffness_given=self.scale_given
@@ -369,9 +369,9 @@ def patched_model(d: Diagnosis) -> Model:
         return d.correction.model
     if not isinstance(d, StackDiagnosis) or d.patch is None:
         raise InputError("No unnamed correction removes more than the extended model does.")
-    found = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
-    given = d.model.provenance.force_scale == "given"
-    return diagnosed_model(found, d.experiments, found.predicted(d.experiments), given)
+    fit = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
+    inputs = d.model.provenance.force_scale == "given"
+    return diagnosed_model(fit, d.experiments, fit.predicted(d.experiments), inputs)
 
 
 def _misfits(

@@ -119,16 +119,16 @@ def view(ground: Ground, axis: Axis) -> View:
     inflation = _inflation(count, total, mean, variance, r)
     gain, significant = _explained(count, total, max(inflation, 1.0) * float(np.mean(variance)))
     explained = gain / ground.residual.size
-    found = replace(
+    result = replace(
         nothing,
         x=10.0**place if axis.log else place,
         mean=mean,
         spread=np.sqrt(inflation * variance / count.sum(1)),
     )
     if not significant:
-        return found
+        return result
     share = float(min(1.0, explained / max(ground.excess, explained)))
-    return replace(found, share=share, significant=True)
+    return replace(result, share=share, significant=True)
 
 
 def _table(
@@ -170,12 +170,12 @@ def _inflation(
     Sums of white noise over n_bj samples of bin b and block j differ from n_bj times the bin's mean
     by a variance that adds up to s_b^2 n_b (1 - sum_j (n_bj/n_b)^2).
     """
-    found = float(np.sum((total - count * mean[:, None]) ** 2))
+    result = float(np.sum((total - count * mean[:, None]) ** 2))
     size = count.sum(1)
     white = float(np.sum(variance * size * (1.0 - np.sum((count / size[:, None]) ** 2, axis=1))))
     if white <= 1e-3 * float(np.sum(variance * size)):
         return correlation_inflation(r)
-    return found / white
+    return result / white
 
 
 def _explained(count: FloatArray, total: FloatArray, noise: float) -> tuple[float, bool]:

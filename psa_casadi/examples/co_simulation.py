@@ -59,8 +59,8 @@ def whole(stack: psa.Model, stage: psa.Model) -> float:
     """Return the stage's position at the end [m], from one set of equations."""
     x, z, t = ca.SX.sym("x", len(stack.state_names)), ca.SX.sym("z", 2), ca.SX.sym("t")
     p, q = stack.parameter_vector(), stage.parameter_vector()
-    _, seen = stack.structure.f(t, x, ca.vertcat(RATE * t, 0.0), p)
-    tip = [seen[stack.output_names.index(name)] for name, _ in TO_STAGE]
+    _, observed = stack.structure.f(t, x, ca.vertcat(RATE * t, 0.0), p)
+    tip = [observed[stack.output_names.index(name)] for name, _ in TO_STAGE]
     zdot, out = stage.structure.f(t, z, ca.vertcat(*tip), q)
     force = out[stage.output_names.index("reaction_force")]
     xdot, _ = stack.structure.f(t, x, ca.vertcat(RATE * t, force), p)

@@ -49,28 +49,28 @@ class Example:
         """The scripts of a recipe, in the order of the page."""
         if self.kind != "recipe":
             return ()
-        return tuple(Script(*found) for found in _BLOCK.findall(self.text))
+        return tuple(Script(*result) for result in _BLOCK.findall(self.text))
 
 
 @cache
 def examples() -> Mapping[str, Example]:
     """Return all examples and then all recipes by their names, each group sorted."""
     folder = resources.files(_PACKAGE)
-    found = {}
+    table = {}
     for module in sorted(pkgutil.iter_modules([str(folder)]), key=lambda m: m.name):
         if module.name in _NOT_EXAMPLES or module.ispkg:
             continue
         text = folder.joinpath(f"{module.name}.py").read_text(encoding="utf-8")
         title = text.split('"""')[1].strip().split("\n")[0].rstrip(".")
-        found[module.name] = Example(module.name, "example", title, text)
+        table[module.name] = Example(module.name, "example", title, text)
     pages = folder.joinpath("recipes")
     for page in sorted(pages.iterdir(), key=lambda p: p.name):
         if page.name.endswith(".md"):
             text = page.read_text(encoding="utf-8")
             name = page.name.removesuffix(".md")
             title = text.split("\n")[0].removeprefix("# ")
-            found[name] = Example(name, "recipe", title, text)
-    return found
+            table[name] = Example(name, "recipe", title, text)
+    return table
 
 
 def run_example(name: str, folder: Path) -> object:

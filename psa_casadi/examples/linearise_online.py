@@ -37,16 +37,16 @@ def main(folder: Path) -> dict[str, float]:
     psa.export_fmu(block, folder / "online_identification_3.fmu", fmi=3)
     psa.export_modelica(block, folder / "OnlineIdentification.mo", name="OnlineIdentification")
     _draw(folder / "linearise_online.png", runs)
-    found = {
+    table = {
         f"nonlinearity, {label} [% of the range]": 100.0 * runs[kind].nonlinearity(LAST)
         for kind, label, _ in _LOOK
     }
     estimate = runs["tracked"].estimate
     if estimate is not None:
-        found["A found over the true one"] = estimate.parameters["A"] / (
+        table["A found over the true one"] = estimate.parameters["A"] / (
             plant.values["A"] * drift(END)["A"]
         )
-    return found
+    return table
 
 
 def _draw(path: Path, runs: dict[str, Drive]) -> None:

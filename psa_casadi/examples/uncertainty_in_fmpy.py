@@ -85,9 +85,9 @@ def _draw(
 ) -> None:
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
-    for name, found in runs.items():
+    for name, result in runs.items():
         if name.startswith("sample"):
-            axes.plot(time, 1e9 * (found["displacement"] - mean), color="#b5bcc2", lw=0.8)
+            axes.plot(time, 1e9 * (result["displacement"] - mean), color="#b5bcc2", lw=0.8)
     band = 1e9 * 1.96 * deviation
     axes.fill_between(time, -band, band, color="#0072b2", alpha=0.25, label="95 %, sigma points")
     axes.plot([], [], color="#b5bcc2", label="samples")

@@ -107,8 +107,8 @@ def optimal_voltage(f: ca.Function, model: psa.Model) -> tuple[FloatArray, Float
     )
     if not solver.stats()["success"]:
         raise RuntimeError(f"IPOPT ended with {solver.stats()['return_status']}")
-    found = np.array(solution["x"]).ravel()
-    return top * found[count:], size[x] * found[:count].reshape(STEPS, len(size))[:, x]
+    result = np.array(solution["x"]).ravel()
+    return top * result[count:], size[x] * result[:count].reshape(STEPS, len(size))[:, x]
 
 
 def _options(cost: ca.MX, unknowns: ca.MX, residuals: int) -> dict[str, Any]:

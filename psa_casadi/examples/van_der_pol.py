@@ -35,7 +35,7 @@ def main(folder: Path) -> dict[str, str | float]:
     psa.export_fmu(oscillator, folder / "van_der_pol.fmu")
     psa.export_fmu(oscillator, folder / "van_der_pol_3.fmu", fmi=3)
     psa.export_modelica(oscillator, folder / "VanDerPol.mo", name="VanDerPol")
-    found: dict[str, str | float] = {}
+    table: dict[str, str | float] = {}
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     axes = figure.subplots()
     for mu, colour in ((1.0, "#0072b2"), (5.0, "#d55e00")):
@@ -44,9 +44,9 @@ def main(folder: Path) -> dict[str, str | float]:
             output_interval=0.02, start_values={"mu": mu}, output=["position"],
         )  # fmt: skip
         axes.plot(result["time"], result["position"], color=colour, label=f"mu = {mu:g}")
-        found[f"amplitude at mu = {mu:g} [m]"] = float(np.abs(result["position"][1000:]).max())
+        table[f"amplitude at mu = {mu:g} [m]"] = float(np.abs(result["position"][1000:]).max())
     axes.set(xlabel="time [s]", ylabel="position [m]", ylim=(-2.4, 3.0))
     axes.grid(color="#e4e7ea")
     axes.legend(loc="upper right", ncols=2)
     figure.savefig(folder / "van_der_pol.png", dpi=110)
-    return found
+    return table

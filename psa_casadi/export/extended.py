@@ -71,11 +71,11 @@ def export_extended(
     Raises InputError for a model that is of no FMU, one without co-simulation, and for effects in
     rates, which are inside; and as `export_fmu`.
     """
-    own = [c for c in model.components if c.foreign]
-    if not own or own[0].foreign is None:
+    items = [c for c in model.components if c.foreign]
+    if not items or items[0].foreign is None:
         raise InputError(f"The model '{model.name}' is of no FMU; write it with psa.export_fmu.")
-    component, file = own[0], own[0].foreign.fmu.file
-    target, place = Path(path), Path(own[0].foreign.place)
+    component, file = items[0], items[0].foreign.fmu.file
+    target, place = Path(path), Path(items[0].foreign.place)
     single = target.suffix.lower() == ".fmu"
     with Archive(place) as archive:
         if archive.description.coSimulation is None:
@@ -124,7 +124,7 @@ def _by_place(model: Model, component: Component) -> dict[str, list[Component]]:
     """Return the effects before and behind an FMU. Raises InputError for any others."""
     places = {f"applied_{i.name}": _BEFORE for i in component.inputs}
     places |= {f"shown_{o.name}": _BEHIND for o in component.outputs}
-    found: dict[str, list[Component]] = {_BEFORE: [], _BEHIND: []}
+    table: dict[str, list[Component]] = {_BEFORE: [], _BEHIND: []}
     for effect in model.effects:
         added = {places.get(name) for name in effect.equations(OnDemand()).add}
         if len(added) != 1 or None in added:
@@ -132,8 +132,8 @@ def _by_place(model: Model, component: Component) -> dict[str, list[Component]]:
                 f"The effect '{effect.name}' acts inside the FMU; only effects at its inputs and"
                 " outputs can stand around it."
             )
-        found[str(added.pop())].append(effect)
-    return found
+        table[str(added.pop())].append(effect)
+    return table
 
 
 def _wired(model: Model, component: Component, groups: dict[str, list[Component]]) -> WiredParts:
@@ -144,9 +144,9 @@ def _wired(model: Model, component: Component, groups: dict[str, list[Component]
     parts: dict[str, Model] = {_ORIGINAL: plain}
     wires: list[Wire] = []
     if groups[_BEFORE]:
-        shown = tuple(Output(f"given_{i.name}", i.unit, i.description) for i in inputs)
-        pairs = tuple((o.name, i.name) for o, i in zip(shown, inputs, strict=True))
-        parts[_BEFORE] = _side(model, component, _BEFORE, inputs, shown, pairs, groups[_BEFORE])
+        displayed = tuple(Output(f"given_{i.name}", i.unit, i.description) for i in inputs)
+        pairs = tuple((o.name, i.name) for o, i in zip(displayed, inputs, strict=True))
+        parts[_BEFORE] = _side(model, component, _BEFORE, inputs, displayed, pairs, groups[_BEFORE])
     if groups[_BEHIND]:
         starts = zip(outputs, _first_outputs(model, component), strict=True)
         read = tuple(Input(f"played_{o.name}", o.unit, o.description, v) for o, v in starts)
@@ -166,8 +166,8 @@ def _wired(model: Model, component: Component, groups: dict[str, list[Component]
         wires.append(Wire(last, Port(OUTSIDE, o.name)))
     names: dict[Port, str] = {}
     if foreign is not None and played is not None:
-        own = [v.name for v in inputs] + [v.name for v in outputs]
-        there = zip(own, (*played.inputs, *played.outputs), strict=True)
+        item = [v.name for v in inputs] + [v.name for v in outputs]
+        there = zip(item, (*played.inputs, *played.outputs), strict=True)
         names = {Port(_ORIGINAL, name): known for name, known in there}
     order = [n for n in (_BEFORE, _ORIGINAL, _BEHIND) if n in parts]
     return WiredParts(model.name, {n: parts[n] for n in order}, tuple(wires), names=names)

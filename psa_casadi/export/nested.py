@@ -51,14 +51,16 @@ def nested(
     """
     with ExitStack() as held:
         archives = {n: held.enter_context(Archive(fmus[n])) for n in wiring.parts}
-        shown = _shown(wiring, archives, starts)
-        digest = hashlib.sha256(repr((shown, *(f.read_bytes() for f in fmus.values()))).encode())
+        displayed = _shown(wiring, archives, starts)
+        digest = hashlib.sha256(
+            repr((displayed, *(f.read_bytes() for f in fmus.values()))).encode()
+        )
         token = f"{{{uuid.UUID(digest.hexdigest()[:32])}}}"
         target = host_platform()
         headers = files("fmpy") / "c-code"
         texts = {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[2]}
         texts["nested.c"] = (sources_directory() / "nested.c").read_text(encoding="utf-8")
-        texts["nested_config.h"] = _config(wiring, archives, shown, token)
+        texts["nested_config.h"] = _config(wiring, archives, displayed, token)
         binary = compile_library(texts, _IDENTIFIER, target)
         entries = {f"binaries/{target.binaries(2)}/{_IDENTIFIER}{target.suffix}": binary}
         for name, archive in archives.items():
@@ -66,7 +68,7 @@ def nested(
                 if file.is_file():
                     place = file.relative_to(archive.directory).as_posix()
                     entries[f"resources/{name}/{place}"] = file.read_bytes()
-        entries["modelDescription.xml"] = _description(wiring, archives, shown, token)
+        entries["modelDescription.xml"] = _description(wiring, archives, displayed, token)
         return entries
 
 
@@ -74,27 +76,27 @@ def _shown(
     wiring: WiredParts, archives: Mapping[str, Archive], starts: Mapping[str, float]
 ) -> list[_Shown]:
     """Return the variables: what is wired outside, and the parameters of every part."""
-    found = []
+    items = []
     for wire in wiring.wires:
         if wire.start.part == OUTSIDE:
             start = _start(archives, wire.end.part, wiring.called(wire.end))
-            found.append(
+            items.append(
                 _Shown(wire.start.name, wire.end.part, wiring.called(wire.end), "input", start)
             )
         elif wire.end.part == OUTSIDE:
-            found.append(
+            items.append(
                 _Shown(wire.end.name, wire.start.part, wiring.called(wire.start), "output")
             )
     for name, archive in archives.items():
         for v in archive.description.modelVariables:
             if v.causality == "parameter" and v.type in ("Real", *_KINDS):
                 start = starts.get(v.name, _start(archives, name, v.name))
-                own = v.name if v.name not in [f.name for f in found] else f"{name}.{v.name}"
-                found.append(_Shown(own, name, v.name, "parameter", start))
-    inputs = {f.variable for f in found if f.causality == "input"}
+                item = v.name if v.name not in [f.name for f in items] else f"{name}.{v.name}"
+                items.append(_Shown(item, name, v.name, "parameter", start))
+    inputs = {f.variable for f in items if f.causality == "input"}
     others = [n for n in archives["original"].names("input") if n in starts and n not in inputs]
-    found += [_Shown(n, "original", n, "input", starts[n]) for n in others]
-    return found
+    items += [_Shown(n, "original", n, "input", starts[n]) for n in others]
+    return items
 
 
 def _start(archives: Mapping[str, Archive], part: str, name: str) -> float:
@@ -103,7 +105,7 @@ def _start(archives: Mapping[str, Archive], part: str, name: str) -> float:
 
 
 def _config(
-    wiring: WiredParts, archives: Mapping[str, Archive], shown: list[_Shown], token: str
+    wiring: WiredParts, archives: Mapping[str, Archive], displayed: list[_Shown], token: str
 ) -> str:
     """Return nested_config.h."""
     order, target = list(archives), host_platform()
@@ -122,12 +124,12 @@ def _config(
         for w in inner
     ]
     places = [
-        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)}}}" for f in shown
+        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)}}}" for f in displayed
     ]
     starts = [
         f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)},"
         f" '{_KINDS.get(archives[f.part].elements[f.variable].type, 'R')}', {f.start!r}}}"
-        for f in shown
+        for f in displayed
         if f.start is not None
     ]
     sizes = {"PARTS": parts, "WIRES": wires, "SHOWN": places, "STARTS": starts}
@@ -155,11 +157,11 @@ def _takes_lines(archive: Archive) -> bool:
 
 
 def _description(
-    wiring: WiredParts, archives: Mapping[str, Archive], shown: list[_Shown], token: str
+    wiring: WiredParts, archives: Mapping[str, Archive], displayed: list[_Shown], token: str
 ) -> bytes:
     """Return modelDescription.xml, as fmpy writes it."""
     variables: list[Any] = []
-    for k, f in enumerate(shown):
+    for k, f in enumerate(displayed):
         of = archives[f.part].variables[f.variable]
         real, start = of.type == "Real", None if f.start is None else repr(f.start)
         if start is not None and not real:
@@ -175,7 +177,7 @@ def _description(
             )
         )  # fmt: skip
     outputs = [Unknown(variable=v) for v in variables if v.causality == "output"]
-    said = ModelDescription(
+    model_description = ModelDescription(
         fmiVersion="2.0", modelName=wiring.name, instantiationToken=token,
         description="an FMU with what was found at its inputs and outputs",
         generationTool=generation_tool(), variableNamingConvention="flat",
@@ -191,5 +193,5 @@ def _description(
         modelVariables=variables, outputs=outputs, initialUnknowns=outputs,
     )  # fmt: skip
     with temporary_folder() as folder:
-        write_model_description(said, folder / "modelDescription.xml")
+        write_model_description(model_description, folder / "modelDescription.xml")
         return (folder / "modelDescription.xml").read_bytes()

@@ -133,7 +133,7 @@ def layout_of(wiring: WiredParts) -> Layout:
     places: dict[Port, Point] = {}
     for b in boxes:
         for kind, x in (("input", b.x1), ("output", b.x2)):
-            names = [n for n, found in wiring.ports(b.name) if found == kind]
+            names = [n for n, result in wiring.ports(b.name) if result == kind]
             for k, name in enumerate(names):
                 places[Port(b.name, name)] = (x, b.y2 - _TITLE - _PITCH * k)
     starts = [_EDGE, *(b.x2 + _GAP for b in boxes)]
@@ -179,7 +179,7 @@ def _boxes(wiring: WiredParts, counts: Sequence[int]) -> tuple[Box, ...]:
     boxes, x = [], _EDGE
     for name, count in zip(wiring.parts, counts, strict=False):
         ports = wiring.ports(name)
-        sides = [[n for n, found in ports if found == kind] for kind in ("input", "output")]
+        sides = [[n for n, result in ports if result == kind] for kind in ("input", "output")]
         longest = sum(max(map(len, side), default=0) for side in sides)
         width = max(_CHAR * (longest + 4), 2.6 * (len(name) + 2))
         x += _GAP + _PITCH / 2 * max(count, 1)
@@ -259,9 +259,9 @@ def _figure(wiring: WiredParts, layout: Layout) -> Figure:
         axes.add_patch(Circle((x, y), 0.9, color=_FRAME if p.part else _LANE, zorder=3))
         unit = wiring.unit(p)
         text = f"{p.name} [{unit}]" if unit and p.part == OUTSIDE else p.name
-        begins = x == lefts[p.part] if p.part else x > 0.0
+        starts = x == lefts[p.part] if p.part else x > 0.0
         axes.text(
-            x + (2.2 if begins else -2.2), y, text, ha="left" if begins else "right",
+            x + (2.2 if starts else -2.2), y, text, ha="left" if starts else "right",
             fontsize=_FONT * _SCALE, **style,
         )  # fmt: skip
     return figure
@@ -305,7 +305,8 @@ def structure_description(
         layout=layout,
         bindings=bindings,
         published={
-            _PUBLISHED.get(name, name): said for name, said in wiring.publication.stated.items()
+            _PUBLISHED.get(name, name): statement
+            for name, statement in wiring.publication.stated.items()
         },
         tool=markup.generation_tool(),
         about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
@@ -343,9 +344,9 @@ def shared_parameters(parts: Mapping[str, Model]) -> dict[str, tuple[str, ...]]:
             owners.setdefault((p.name, p.unit, model.values[p.name]), []).append(part)
     names = [name for name, _, _ in owners]
     return {
-        name: tuple(found)
-        for (name, _, _), found in owners.items()
-        if len(found) > 1 and names.count(name) == 1
+        name: tuple(result)
+        for (name, _, _), result in owners.items()
+        if len(result) > 1 and names.count(name) == 1
     }
 
 
@@ -357,15 +358,15 @@ def parameter_files(
     entries: dict[str, str] = {}
     bindings, lifted = [], dict[str, Row]()
     for part, model in parts.items():
-        own = []
+        items = []
         for row in parameter_rows(model):
             if part in shared.get(row[0], ()):
                 lifted.setdefault(row[0], row)
             else:
-                own.append(row)
-        if own:
+                items.append(row)
+        if items:
             place = f"{_FOLDER}/{part}.ssv"
-            entries[place] = set_text(model.name, own)
+            entries[place] = set_text(model.name, items)
             bindings.append(Binding(part, place))
     if lifted:
         values, mapping = f"{_FOLDER}/shared.ssv", f"{_FOLDER}/shared.ssm"
@@ -425,8 +426,8 @@ def linear(wiring: WiredParts) -> Linear:
         s, size = model.structure, model.state_nominals()
         rest = [[v.start for v in group] for group in (s.states, s.inputs)]
         held = [[v.start for v in s.sampled]] if s.sampled else []
-        found = s.slopes(0.0, *rest, model.parameter_vector(), *held)
-        a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in found)
+        result = s.slopes(0.0, *rest, model.parameter_vector(), *held)
+        a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in result)
         pieces.append((a / size[:, None] * size, b / size[:, None], c * size, d))
     a, b, c, d = (scipy.linalg.block_diag(*(p[k] for p in pieces)) for k in range(4))
     ends = [(part, n) for part, model in wiring.parts.items() for n in model.input_names]

@@ -89,9 +89,9 @@ def begun_module(model: Model) -> "Future[bytes | None]":
             return None
 
     pool = ThreadPoolExecutor(max_workers=1)
-    found = pool.submit(copy_context().run, module)
+    future = pool.submit(copy_context().run, module)
     pool.shutdown(wait=False)
-    return found
+    return future
 
 
 @cache
@@ -118,11 +118,11 @@ def module_texts(structure: Structure) -> Mapping[str, str]:
     """Return the generated files of a module by their names."""
     s = structure
     outputs = [o.name for o in s.outputs]
-    shown, split = next((n for n in SHOWN if n in outputs), None), split_of(s)
+    displayed, split = next((n for n in SHOWN if n in outputs), None), split_of(s)
     exact = {}
-    if shown is not None and not isinstance(split, str):
+    if displayed is not None and not isinstance(split, str):
         with suppress(Unprintable):  # then it takes no exact steps
-            exact["exact_model.h"] = generate(split, (shown,))
+            exact["exact_model.h"] = generate(split, (displayed,))
     by_input = ca.Function(
         "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
     )

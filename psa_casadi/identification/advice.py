@@ -84,21 +84,21 @@ def plans(models: Sequence[Model], records: Sequence[Record]) -> list[Plan]:
     lowest = _round(min(now, 20.0 / settling, finest))
     count = min(_RUNGS, ceil(2.0 * log10(finest / lowest)) + 1)
     rates = sorted({_round(float(r)) for r in np.geomspace(lowest, finest, count)})
-    found = [p for rate in rates for p in _fast(rate, low, high)]
+    items = [p for rate in rates for p in _fast(rate, low, high)]
     # loops of a frequency at which records cycle slowly, else of a quasi-static one
     limit = _QUASI_STATIC / settling
     turns = [(len(reversals(r.voltage)), r.duration) for r in records]
     cycling = [count / (2.0 * length) for count, length in turns if count >= 2]
     slow = [f for f in cycling if f <= limit]
-    found += _loops(_round(float(np.median(slow)) if slow else 0.1 * limit), settling, low, high)
+    items += _loops(_round(float(np.median(slow)) if slow else 0.1 * limit), settling, low, high)
     if models[0].effects:
         longest = max(r.duration for r in records)
         lengths = [longest * k for k in (10.0, 100.0) if longest * k <= _LONGEST_HOLD]
-        found += [
+        items += [
             _stepped("hold", HOLD_SAMPLES / n, HOLD_SAMPLES, low, high, HOLD_SAMPLES)
             for n in lengths
         ]
-    return found
+    return items
 
 
 def _round(value: float) -> float:
@@ -164,7 +164,7 @@ def scenarios(model: Model, open_names: Collection[str]) -> list[Model]:
     """
     names = [n for n in SEARCHABLE if n in model.values and n in open_names]
     lags = [n for n in names if n in _LAGS]
-    total, found = sum(_lag(model.values, n) for n in lags), []
+    total, models = sum(_lag(model.values, n) for n in lags), []
     for weights, damping in _CASES:
         values = dict(model.values)
         for name in lags:
@@ -175,8 +175,8 @@ def scenarios(model: Model, open_names: Collection[str]) -> list[Model]:
                 c, k = (values[q + name[1:]] for q in "ck")
                 values[name] = (0.5 * c / damping) ** 2 / k
             values[name] = float(np.clip(values[name], *model.parameter(name).bounds))
-        found.append(model.with_values(values))
-    return found
+        models.append(model.with_values(values))
+    return models
 
 
 def _lag(values: Mapping[str, float], name: str) -> float:
@@ -224,7 +224,7 @@ class Advice(Worded):
 def advice(
     fit: Fit,
     experiments: Sequence[Experiment],
-    found: Determinacy,
+    determinacy: Determinacy,
     *,
     force_scale_given: bool = False,
 ) -> tuple[Advice, ...]:
@@ -239,7 +239,7 @@ def advice(
     determine much come before others, those that need no faster sampling than the records at hand
     before others. What no single one determines may need several, or repeats.
     """
-    return _Adviser(fit, experiments, found).all(force_scale_given)
+    return _Adviser(fit, experiments, determinacy).all(force_scale_given)
 
 
 class _Adviser:
@@ -255,9 +255,9 @@ class _Adviser:
         prior = prior_information(fit.model, found.names)
         white = standard_errors(known[:count, :count] + prior)
         sizes = np.abs(sizes_of(fit.model, found.names))
-        told = np.array([found.standard_errors[n] for n in found.names]) / sizes
-        sure = told < DETERMINED_WIDTH
-        ratio = max(float(np.median((told / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
+        output = np.array([found.standard_errors[n] for n in found.names]) / sizes
+        sure = output < DETERMINED_WIDTH
+        ratio = max(float(np.median((output / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
         errors = standard_errors(known / ratio + prior_information(fit.model, self._names))
         self._open = {
             n
@@ -299,10 +299,10 @@ class _Adviser:
             known, counts[plan] = known + information, 1
             instead = tuple(  # plans of the other fast kind that do as well at the same rate
                 other
-                for other, own in options
+                for other, item in options
                 if other.rate == plan.rate
                 and {other.kind, plan.kind} == {"step", "multisine"}
-                and set(gain) <= set(self._gain(self._known + own, self._open))
+                and set(gain) <= set(self._gain(self._known + item, self._open))
             )
             results.append(Advice("single", gain, plan, instead=instead))
         wanted = left & set(self._found.names)
@@ -329,17 +329,17 @@ class _Adviser:
 
         def one(plan: Plan) -> _Option | None:
             try:
-                found = [
+                results = [
                     record_information(m, plan.record, self._names, self._noise)
                     for m in self._scenarios
                 ]
             except PsaError:
                 return None
-            return plan, np.array(found)
+            return plan, np.array(results)
 
         records = [e.record for e in self._experiments]
-        found = side_by_side(one, plans(self._scenarios, records))
-        return [option for option in found if option is not None]
+        results = side_by_side(one, plans(self._scenarios, records))
+        return [option for option in results if option is not None]
 
     def _gain(self, information: FloatArray, left: set[str]) -> tuple[str, ...]:
         """Return the parameters of `left` that are sure with this information in every scenario."""

@@ -140,7 +140,7 @@ class Combination(Worded):
 
 
 def free_combinations(
-    model: Model, found: Determinacy, *, force_scale_given: bool = False
+    model: Model, determinacy: Determinacy, *, force_scale_given: bool = False
 ) -> tuple[Combination, ...]:
     """Return what is known of parameters that trade off, in as few and simple formulas as possible.
 
@@ -152,22 +152,24 @@ def free_combinations(
     is listed with the parameters it is correlated with. The scale of force and the product with an
     assumed capacitance follow from the model's form; they come last.
     """
-    judge = _Judge(model, found)
+    judge = _Judge(model, determinacy)
     results: list[Combination] = []
-    candidates = [c for f in physical_formulas(model.values, found.names) if (c := judge.known(f))]
-    open_ones = {n for n in found.names if judge.relative(n) > WEAK}
+    candidates = [
+        c for f in physical_formulas(model.values, determinacy.names) if (c := judge.known(f))
+    ]
+    open_ones = {n for n in determinacy.names if judge.relative(n) > WEAK}
     while news := [c for c in candidates if open_ones & set(c[0].parameters)]:
         best, _ = min(news, key=lambda c: c[1] / len(open_ones & set(c[0].parameters)))
         results.append(best)
         open_ones -= set(best.parameters)
-    left = [n for n in found.undetermined if n in open_ones]
-    for formula in monomials(model.values, found.names):
+    left = [n for n in determinacy.undetermined if n in open_ones]
+    for formula in monomials(model.values, determinacy.names):
         simple = judge.known(formula) if set(left) & set(formula.names) else None
         if simple:
             results.append(simple[0])
             left = [n for n in left if n not in simple[0].parameters]
     results += judge.rest(left)
-    if "R_s" in found.names and "C_p" in model.values and "C_p" not in found.names:
+    if "R_s" in determinacy.names and "C_p" in model.values and "C_p" not in determinacy.names:
         results.append(Combination("product", ("R_s", "C_p"), "R_s C_p"))
     if not force_scale_given:
         scaled = tuple(p.name for p in model.structure.parameters if p.unit in _FORCES)
@@ -187,7 +189,7 @@ class _Judge:
         With it comes a rank, the smallest for a formula that is sure and short: its standard error
         over what one of the parameters would make it, doubled by each parameter that is free.
         """
-        found, names = self._found, self._found.names
+        result, names = self._found, self._found.names
         order = formula.names if formula.physical else names
         free = [n for n in order if n in names and n in formula.names]
         values, gradient = self._model.values, np.zeros(len(names))
@@ -196,17 +198,17 @@ class _Judge:
             up, down = (formula.value({**values, n: values[n] + h}) for h in (step, -step))
             gradient[names.index(n)] = (up - down) / (2.0 * step)
         value = abs(formula.value(values))
-        error = float(np.sqrt(max(float(gradient @ found.covariance @ gradient), 0.0)))
-        alone = {n: abs(gradient[names.index(n)]) * found.standard_errors[n] for n in free}
+        error = float(np.sqrt(max(float(gradient @ result.covariance @ gradient), 0.0)))
+        alone = {n: abs(gradient[names.index(n)]) * result.standard_errors[n] for n in free}
         parts = tuple(n for n in free if alone[n] >= SURER * error)
         if error > KNOWN * value or len(parts) < (2 if formula.physical else len(free)):
             return None
-        only = any(n in found.undetermined for n in parts)
-        told = Combination(
+        only = any(n in result.undetermined for n in parts)
+        combination = Combination(
             "only" if only else "traded", parts, formula.text, error / value, formula.meaning,
             () if only else tuple(self.relative(n) for n in parts),
         )  # fmt: skip
-        return told, error / max(alone.values()) * 2.0 ** len(free)
+        return combination, error / max(alone.values()) * 2.0 ** len(free)
 
     def rest(self, names: Sequence[str]) -> Iterator[Combination]:
         """Yield undetermined parameters that no formula explains, with what they are tied to."""

@@ -33,7 +33,7 @@ _NOISE = 6.0 * np.sqrt(2.0)
 
 def evidence_of(
     fit: Fit,
-    found: Determinacy,
+    determinacy: Determinacy,
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     *,
@@ -51,7 +51,7 @@ def evidence_of(
     for k, (e, y) in enumerate(zip(experiments, predicted, strict=True)):
         x0 = record_start(model, e.record, fit.unknowns.start(theta, k))
         errors = measured(e.record) - y
-        given = sampled[k] if sampled else e.record
+        inputs = sampled[k] if sampled else e.record
         used.append(errors[e.used])
         runs.append(
             RecordRun(
@@ -60,21 +60,21 @@ def evidence_of(
                 start=dict(zip(model.state_names, x0.tolist(), strict=True)),
                 offset_m=float(y[0]) - _shown(model, e.record, x0),
                 samples=e.record.n,
-                averaged=max(1, round(e.record.sample_time / given.sample_time)),
+                averaged=max(1, round(e.record.sample_time / inputs.sample_time)),
                 fitted_m=_rms(errors[e.known]),
                 held_out_m=_rms(errors[e.held_out]) if e.held_out.any() else None,
                 held_out=tuple(runs_of(e.held_out)),
             )
         )
     chosen = next((k for k, e in enumerate(experiments) if e.held_out_whole), 0)
-    matrix = 0.5 * (found.covariance + found.covariance.T)
+    matrix = 0.5 * (determinacy.covariance + determinacy.covariance.T)
     known = np.isfinite(matrix).all()  # without names where it has overflowed
     rows = tuple(tuple(row) for row in matrix.tolist())
     return Evidence(
         by=by,
         fitted_m=_rms(np.concatenate(used)),
         seen=_seen(records),
-        covariance=Covariance(found.names, rows) if known else Covariance((), ()),
+        covariance=Covariance(determinacy.names, rows) if known else Covariance((), ()),
         runs=tuple(runs),
         reference=_reference(model, records[chosen]),
         outside=tuple(c.name for c in model.effects if not c.in_plant),
@@ -119,9 +119,9 @@ def _reference(model: Model, record: Record) -> ReferenceRun:
     kept = np.arange(0, min(record.n, _LONGEST * stride), stride)
     columns = {n: getattr(record, n, None) for n in model.input_names}
     inputs = {n: _rounded(c[kept]) for n, c in columns.items() if c is not None}
-    shown = measured(record)[kept]
-    valid = np.isfinite(shown)
-    digits = iter(_rounded(shown[valid]))
+    displayed = measured(record)[kept]
+    valid = np.isfinite(displayed)
+    digits = iter(_rounded(displayed[valid]))
     return ReferenceRun(
         record=record.name,
         time=tuple(round(float(t), 12) for t in record.time[kept] - record.time[0]),
@@ -136,8 +136,8 @@ def _told_by(record: Record, stride: int) -> bool:
     time, voltage = record.time[part], record.voltage[part]
     lines = np.interp(time, time[::stride], voltage[::stride])
     last = (len(time) - 1) // stride * stride + 1
-    missed = np.abs(lines - voltage)[:last]
-    return bool(np.max(missed) <= _MISSED * max(float(np.ptp(record.voltage)), 1e-300))
+    misfit = np.abs(lines - voltage)[:last]
+    return bool(np.max(misfit) <= _MISSED * max(float(np.ptp(record.voltage)), 1e-300))
 
 
 def _rounded(values: FloatArray) -> tuple[float, ...]:

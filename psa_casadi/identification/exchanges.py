@@ -75,16 +75,16 @@ def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) 
     """Free the fast parameters that these records can tell, if that lowers the cost clearly."""
     free = best.unknowns.names
     available = [n for n in FAST if n in best.model.values and n not in (*free, "k_P")]
-    told = [n for n in available if _can_tell(best, experiments, n)]
-    if not told:
+    items = [n for n in available if _can_tell(best, experiments, n)]
+    if not items:
         return best
-    progress(f"base fit with {', '.join(told)}")
+    progress(f"base fit with {', '.join(items)}")
     states = best.starts()
     try:
-        wider = fit(best.model, experiments, [*free, *told], sigma=best.sigma, start_states=states)
+        wider = fit(best.model, experiments, [*free, *items], sigma=best.sigma, start_states=states)
     except PsaError:
         return best
-    needed = len(told) * np.log(len(best.residuals))
+    needed = len(items) * np.log(len(best.residuals))
     return wider if wider.interrupted or wider.data_cost < best.data_cost - needed else best
 
 
@@ -170,9 +170,9 @@ def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
     `number` is the record's place in the fit; the error is far below what sensors see. Raises
     PsaError where it cannot be simulated.
     """
-    found = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
+    trajectory = simulate_record(fit.model, record, memory=fit.start(number), rtol=_FORCE_RTOL)
     s = fit.model.structure
-    states = np.array([found.states[n] for n in fit.model.state_names])
+    states = np.array([trajectory.states[n] for n in fit.model.state_names])
     inputs = record_inputs(fit.model, record, record.n).T
     force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
     values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())

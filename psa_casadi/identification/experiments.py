@@ -30,13 +30,13 @@ def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> l
 
 def undecided(records: Any, hold: Hold | None) -> bool:
     """Whether nobody said what inputs do between samples: no `hold`, and no `Signals`."""
-    given = records if isinstance(records, list | tuple) else [records]
-    return hold is None and not any(isinstance(r, Signals) for r in given)
+    inputs = records if isinstance(records, list | tuple) else [records]
+    return hold is None and not any(isinstance(r, Signals) for r in inputs)
 
 
 def experiments_of(
     model: Model,
-    given: Sequence[Signals],
+    signals: Sequence[Signals],
     holdout: Sequence[Signals] = (),
     *,
     judged: bool = True,
@@ -54,8 +54,8 @@ def experiments_of(
     else, and where no output was measured.
     """
     problems = Problems()
-    fitted = {s.sha256: s.name for s in given}
-    parts = [[in_units(model, s, problems) for s in part] for part in (given, holdout)]
+    fitted = {s.sha256: s.name for s in signals}
+    parts = [[in_units(model, s, problems) for s in part] for part in (signals, holdout)]
     for s in (s for part in parts for s in part):
         _check(model, s, problems)
     for s in [s for s in holdout if s.sha256 in fitted]:
@@ -65,51 +65,53 @@ def experiments_of(
         )
     problems.raise_if_any()
     clean = [[_cleaned(model, s) for s in part] for part in parts]
-    clean = [[own for s in part for own in _cut(model, *s)] for part in clean]
+    clean = [[items for s in part for items in _cut(model, *s)] for part in clean]
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
-    records = cast("Sequence[Any]", [own for part in clean for own in part])
-    begins: dict[str, float] = {}  # a part of a record begins anywhere
+    records = cast("Sequence[Any]", [items for part in clean for items in part])
+    values: dict[str, float] = {}  # a part of a record begins anywhere
     for s, _ in records:
-        begins[s.sha256] = min(s.time[0], begins.get(s.sha256, np.inf))
-    found = [
-        replace(e, record=s, known_start=known_start and not later, later_part=later, remarks=said)
-        for e, (s, said) in zip(split, records, strict=True)
-        for later in [s.time[0] > begins[s.sha256]]
+        values[s.sha256] = min(s.time[0], values.get(s.sha256, np.inf))
+    result = [
+        replace(
+            e, record=s, known_start=known_start and not later, later_part=later, remarks=statement
+        )
+        for e, (s, statement) in zip(split, records, strict=True)
+        for later in [s.time[0] > values[s.sha256]]
     ]
     channels = []
     for o in model.structure.outputs:
         channel = Channel(
             o.name, o.unit, (o.name,), straight=STRAIGHT, offset=o.name in zeros, factors=False
         )
-        own = [replace(e, channels=(channel,)) for e in found]
-        fitted_ones = np.concatenate([e.measured(0)[e.at(0)] for e in own])
+        items = [replace(e, channels=(channel,)) for e in result]
+        fitted_ones = np.concatenate([e.measured(0)[e.at(0)] for e in items])
         spread = float(np.std(fitted_ones)) if fitted_ones.size else 0.0
         if spread > 0.0:
             channels.append(replace(channel, level=_FIRST_LEVEL * spread))
     if not channels:
         raise InputError("No output moves in these records; there is nothing to fit.")
-    return tuple(replace(e, channels=tuple(channels)) for e in found)
+    return tuple(replace(e, channels=tuple(channels)) for e in result)
 
 
 def _cut(
-    model: Model, s: Signals, said: tuple[Note | str, ...]
+    model: Model, s: Signals, statement: tuple[Note | str, ...]
 ) -> list[tuple[Signals, tuple[Note | str, ...]]]:
     """Return the parts of signals between gaps that hide a motion of an input that is no stairs."""
     parts, cut = without_gaps([s], model.input_names if s.hold == "linear" else ())
-    return [(p, () if k else (*said, *cut)) for k, p in enumerate(parts)]
+    return [(p, () if k else (*statement, *cut)) for k, p in enumerate(parts)]
 
 
 def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note | str, ...]]:
     """Return signals without the samples that an output's sensor has made, and what these are."""
     inputs = {n: s.columns[n] for n in model.input_names}
-    columns, said = dict(s.columns), list[Note]()
+    columns, statement = dict(s.columns), list[Note]()
     for o in model.structure.outputs:
         if o.name in columns:
-            found = suspects_of(o.name, columns[o.name], o.unit, inputs)
-            columns[o.name] = np.where(found.mask, np.nan, columns[o.name])
-            said += found.notes(f"{o.name} of {s.name}")
-    return replace(s, columns=columns), tuple(said)
+            suspects = suspects_of(o.name, columns[o.name], o.unit, inputs)
+            columns[o.name] = np.where(suspects.mask, np.nan, columns[o.name])
+            statement += suspects.notes(f"{o.name} of {s.name}")
+    return replace(s, columns=columns), tuple(statement)
 
 
 def varied(model: Model, e: Experiment) -> str | None:
@@ -127,7 +129,7 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
     records = cast("Sequence[Any]", [e.record for e in experiments])
     lines = [r for r in records if r.hold == "linear"]
     held = {
-        n: tuple(name for name, own in in_parts(lines) if n in stairs(own[0], (n,)))
+        n: tuple(name for name, item in in_parts(lines) if n in stairs(item[0], (n,)))
         for n in model.input_names
     }
     absent = [n for n in model.output_names if all(r.column(n) is None for r in records)]
@@ -143,7 +145,7 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
             for n in absent
         ),
         *units,
-        *(said for e in experiments for said in e.remarks),
+        *(statement for e in experiments for statement in e.remarks),
     )
 
 
@@ -155,14 +157,14 @@ def _units(model: Model) -> dict[str, str]:
 def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
     """Return the same samples in the units of a model; where that states none, in SI units."""
     columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
-    for name, own in _units(model).items():
+    for name, item in _units(model).items():
         unit = s.units.get(name)
         if not unit or name not in columns:
             continue
         try:
             read = parse_unit(unit)
-            if own != "1" or read.dimension == parse_unit(own).dimension:
-                columns[name], units[name] = convert(columns[name], unit, own), own
+            if item != "1" or read.dimension == parse_unit(item).dimension:
+                columns[name], units[name] = convert(columns[name], unit, item), item
             elif read.ratio != 1 or read.offset:
                 problems.add(
                     f"{where}: column '{name}' is in '{unit}', of which the model '{model.name}'"
@@ -171,7 +173,7 @@ def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
                 )
         except InputError as error:
             problems.add(
-                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{own}'."
+                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{item}'."
             )
     return replace(s, columns=columns, units=units)
 

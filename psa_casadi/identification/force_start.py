@@ -66,8 +66,8 @@ def retuned(
     for _ in range(_REPEATS):
         levels = residual_noise(best, experiments)
         pairs = zip(record_rms(best, experiments), levels, strict=True)
-        missed = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
-        if best.interrupted or not missed:
+        misfit = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
+        if best.interrupted or not misfit:
             return best
         progress("base fit, mechanics again behind the force found")
         try:
@@ -86,11 +86,11 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
     parts = list(_parts(best, experiments))
     if not parts:
         return None
-    own = log(best.model.values["k_P"] / best.model.values["k_B"])
-    starts = [s for e in parts for s in placed(e, e.v, _ORDERS, (own, -own), weak=False)]
+    item = log(best.model.values["k_P"] / best.model.values["k_B"])
+    starts = [s for e in parts for s in placed(e, e.v, _ORDERS, (item, -item), weak=False)]
     names = list(dict.fromkeys([*best.unknowns.names, *_FREE]))
     forces = {s.name for s in best.model.structure.states if s.unit == "N"}
-    begun = []
+    items = []
     for linear in sought(parts, starts, _ROUNDS, ratio_free=True)[0][:_BEGUN]:
         values = _values(best, linear.theta)
         scale = values["k_L"] / best.model.values["k_L"]  # memories of forces change with them
@@ -101,10 +101,10 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
             best, best.model.with_values(values), experiments, names,
             start_states=states, evaluations=_QUICK,
         )  # fmt: skip
-        begun += [quick] if quick is not None else []
-    found = sorted(begun, key=lambda f: f.data_cost)[:_ENDED]
-    ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in found]
-    if any(f.interrupted for f in (*found, *ended)):
+        items += [quick] if quick is not None else []
+    result = sorted(items, key=lambda f: f.data_cost)[:_ENDED]
+    ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in result]
+    if any(f.interrupted for f in (*result, *ended)):
         raise KeyboardInterrupt
     return min(ended, key=lambda f: f.data_cost, default=None)
 
@@ -152,7 +152,7 @@ def _values(best: Fit, theta: FloatArray) -> dict[str, float]:
     p = best.model.values
     one, two, a_p, q_p, a_b, q_b, ratio = np.exp(theta).tolist()
     k_b, k_p = p["k_B"], ratio * p["k_B"]
-    found = {
+    table = {
         "tau": max(one, two),
         "R_s": p["R_s"] + min(one, two) / p["C_p"],
         "k_P": k_p,
@@ -161,7 +161,7 @@ def _values(best: Fit, theta: FloatArray) -> dict[str, float]:
         "c_B": a_b * k_b,
         "m_B": q_b * k_b,
     }
-    scale = static_compliance(p) / static_compliance({**p, **found})
-    found |= {n: scale * p[n] for n in _FORCES if n in p}
-    bounds = {n: best.model.parameter(n).bounds for n in found}
-    return {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}
+    scale = static_compliance(p) / static_compliance({**p, **table})
+    table |= {n: scale * p[n] for n in _FORCES if n in p}
+    bounds = {n: best.model.parameter(n).bounds for n in table}
+    return {n: float(np.clip(v, *bounds[n])) for n, v in table.items()}

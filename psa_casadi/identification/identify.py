@@ -105,9 +105,9 @@ def identify(
     every = [r for r, _ in ready]
     fitted, long = excerpts(every)
     known = {r.sha256: r for r in parts}
-    said = [*cut, *(s for _, own in ready for s in own), *long]
-    refuse_few(given_records, fitted, texts(tuple(said)))
-    start, given = chosen_start(every, model, stiffness)
+    items = [*cut, *(s for _, item in ready for s in item), *long]
+    refuse_few(given_records, fitted, texts(tuple(items)))
+    start, inputs = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
     start = forms[0]
@@ -117,27 +117,27 @@ def identify(
     if model is None:
         progress("starting values from the records")
         linear = linear_start(fitted, start.values)
-    found, preferred = search_forms(
+    result, preferred = search_forms(
         forms,
         experiments,
         linear=linear.candidates if linear else (),
         thorough=True,
         progress=progress,
     )
-    best, experiments = _on_even_clock(*relevelled(found.best, experiments), said)
+    best, experiments = _on_even_clock(*relevelled(result.best, experiments), items)
     best = _with_own_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
     determined = determinacy(
-        best, experiments, not_unique=found.not_unique, assumed=assumed_ratio(best, experiments)
+        best, experiments, not_unique=result.not_unique, assumed=assumed_ratio(best, experiments)
     )
-    open_ones = free_combinations(best.model, determined, force_scale_given=given)
+    open_ones = free_combinations(best.model, determined, force_scale_given=inputs)
     advised: tuple[Advice, ...] | None = None
-    told: Evidence | None = None
+    evidence: Evidence | None = None
     noise: tuple[NoiseFound, ...] = ()
     if not best.interrupted:
         try:
-            told = evidence_of(
+            evidence = evidence_of(
                 best,
                 determined,
                 experiments,
@@ -147,7 +147,7 @@ def identify(
             )
             noise = noise_found(best, experiments, parts)
             progress("what further records would tell")
-            advised = advice(best, experiments, determined, force_scale_given=given)
+            advised = advice(best, experiments, determined, force_scale_given=inputs)
         except KeyboardInterrupt:
             current_work().wrap_up()
     return StackIdentification(
@@ -155,21 +155,21 @@ def identify(
             best.model,
             determined,
             given_records,
-            given,
+            inputs,
             interrupted=best.interrupted,
-            evidence=told,
+            evidence=evidence,
         ),
         fit=best,
         determinacy=determined,
         experiments=experiments,
         doubts=(
             *(s for doubt in _DOUBTS if (s := doubt(fitted))),
-            *doubts_of(best, determined, found.starts, found.not_unique),
+            *doubts_of(best, determined, result.starts, result.not_unique),
             *_missed(best, experiments),
         ),
-        starts=found.starts,
+        starts=result.starts,
         notes=(
-            *said,
+            *items,
             *((preferred,) if preferred else ()),
             *columns.left_out,
             *(" ".join(texts(f.notes)) for f in best.further),
@@ -184,7 +184,7 @@ def identify(
 
 def with_provenance(
     model: Model,
-    found: Determinacy,
+    result: Determinacy,
     records: Sequence[Record],
     stiffness_given: bool,
     *,
@@ -195,10 +195,10 @@ def with_provenance(
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
     fits = current is not None and current.source == "current" and current.is_that_of(c_p)
-    told = {"C_p": current.interval} if current is not None and fits else {}
+    output = {"C_p": current.interval} if current is not None and fits else {}
     return replace(
         with_told(
-            model, records, found.names, {**told, **found.intervals},
+            model, records, result.names, {**output, **result.intervals},
             force_scale="given" if stiffness_given else "assumed",
             interrupted=interrupted,
             notes=(
@@ -222,14 +222,14 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
 
 
 def _on_even_clock(
-    best: Fit, experiments: tuple[Experiment, ...], said: list[Note | str]
+    best: Fit, experiments: tuple[Experiment, ...], statement: list[Note | str]
 ) -> tuple[Fit, tuple[Experiment, ...]]:
     """Fit samples at even times where the data say that the stamps jitter."""
     even = None if best.interrupted else even_clock(best, experiments)
     if even is not None:
         again = refit(best, even[0])
         if again.rms < best.rms:
-            said.append(even[1])
+            statement.append(even[1])
             return again, even[0]
     return best, experiments
 

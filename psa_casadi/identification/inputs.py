@@ -36,23 +36,25 @@ def read_otherwise(
     Held or straight lines between samples, where that is `undecided`; then straight lines through
     noisy readings, or through smoothed ones.
     """
-    best, read, said = of, tuple(experiments), tuple[Note, ...]()
+    best, read, statement = of, tuple(experiments), tuple[Note, ...]()
     if undecided and (other := held_otherwise(best, read)):
-        best, read, told = other
-        said = (told,)
+        best, read, output = other
+        statement = (output,)
     if other := _smoothed_instead(best, read):
-        best, read, told = other
-        said = (*said, told)
-    return best, read, said
+        best, read, output = other
+        statement = (*statement, output)
+    return best, read, statement
 
 
 def read_like(
-    experiments: Sequence[Experiment], hold: Hold, said: Sequence[Note]
+    experiments: Sequence[Experiment], hold: Hold, notes: Sequence[Note]
 ) -> tuple[Experiment, ...]:
-    """Return experiments whose inputs are read as those were of which that was `said`."""
-    found = held_as(experiments, hold)
-    names = [n for told in said if told.code == "inputs_smoothed" for n in told.values["inputs"]]
-    return tuple(_smoothed(e, names)[0] for e in found)
+    """Return experiments whose inputs are read as those were of which that was `notes`."""
+    result = held_as(experiments, hold)
+    names = [
+        n for output in notes if output.code == "inputs_smoothed" for n in output.values["inputs"]
+    ]
+    return tuple(_smoothed(e, names)[0] for e in result)
 
 
 def _smoothed_instead(
@@ -106,13 +108,13 @@ def _instead(
 ) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
     """Return the fit of other experiments and its note, where it is `LIKELIER`."""
     try:
-        found = refitted(of, others)
+        fit = refitted(of, others)
     except PsaError:
         return None
-    nats = likelier(found, of)
+    nats = likelier(fit, of)
     if nats < LIKELIER:
         return None
-    best, again = relevelled(found, others, every=True)
+    best, again = relevelled(fit, others, every=True)
     return best, again, note(code, **values, nats=nats)
 
 

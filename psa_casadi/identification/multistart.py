@@ -70,7 +70,7 @@ def fits_from(
     A keyboard interrupt ends it with those that there are, if any. Raises what the first one raised
     where none can be simulated.
     """
-    found, first = list[tuple[str, Fit]](), None
+    result, first = list[tuple[str, Fit]](), None
     for name, start in starts:
         try:
             one = quick(name, start)
@@ -78,15 +78,15 @@ def fits_from(
             first = first or error
             continue
         except KeyboardInterrupt:
-            if not found:
+            if not result:
                 raise
-            return [(n, replace(f, interrupted=True, converged=False)) for n, f in found]
-        found.append((name, one))
+            return [(n, replace(f, interrupted=True, converged=False)) for n, f in result]
+        result.append((name, one))
         if one.interrupted:
             break
-    if first is not None and not found:
+    if first is not None and not result:
         raise first
-    return found
+    return result
 
 
 def search_starts(
@@ -103,34 +103,37 @@ def search_starts(
     can be simulated.
     """
     sigma = [experiments[0].channels[0].level] * len(experiments)
-    seen = seen_starts(model, experiments)
+    observed = seen_starts(model, experiments)
     rng, declared = np.random.default_rng(_SEED), model.values
     drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
-    begins = [("declared values", {}), *((f"random values {k}", v) for k, v in enumerate(drawn, 1))]
+    begin_times = [
+        ("declared values", {}),
+        *((f"random values {k}", v) for k, v in enumerate(drawn, 1)),
+    ]
 
     def quick(name: str, values: Mapping[str, float]) -> Fit:
         progress(f"fit from {name}")
         return fit(
-            model.with_values(values), experiments, free, sigma=sigma, start_states=seen,
+            model.with_values(values), experiments, free, sigma=sigma, start_states=observed,
             evaluations=_QUICK if starts > 1 else 3 * _QUICK,
             tolerance=1e-4 if starts > 1 else 1e-6,
         )  # fmt: skip
 
     try:
-        found = sorted(fits_from(begins, quick), key=lambda pair: pair[1].cost)
+        items = sorted(fits_from(begin_times, quick), key=lambda pair: pair[1].cost)
     except PsaError as error:
         raise SimulationError(
             f"The model '{model.name}' cannot be simulated on these records from any start; check"
             f" the units of its inputs, its values and their bounds. At its own values: {error}"
         ) from error
-    cut = any(f.interrupted for _, f in found)
+    cut = any(f.interrupted for _, f in items)
     ended = [
         refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
-        for _, f in found[: 0 if cut or starts == 1 else _FOLLOWED]
+        for _, f in items[: 0 if cut or starts == 1 else _FOLLOWED]
     ]
-    fits = dict(found) | {name: f for (name, _), f in zip(found, ended, strict=False)}
+    fits = dict(items) | {name: f for (name, _), f in zip(items, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)
-    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begins)
+    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begin_times)
     if cut:
         return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
     return *levelled(best, experiments), outcomes
@@ -160,27 +163,27 @@ def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[st
     y, x, der = model.structure.y, model.structure.x, model.structure.der
     names = [x[k].name() for k in range(x.numel())]
     starts = {q.name: q.start for q in model.structure.states}
-    shown = [
+    items = [
         (model.output_names[j], y[j].name())
         for j in range(y.numel())
         if y[j].is_symbolic() and y[j].name() in names
     ]
-    found = []
+    result = []
     for e in experiments:
-        own, known = {}, e.known if e.held_out_whole else e.used
-        for output, state in shown:
+        item, known = {}, e.known if e.held_out_whole else e.used
+        for output, state in items:
             readings = e.record.column(output)
             if readings is None or e.known_start:
                 continue
             valid = np.flatnonzero(known & np.isfinite(readings))
             if valid.size:
-                own[state] = float(readings[valid[0]]) - starts[state]
+                item[state] = float(readings[valid[0]]) - starts[state]
             rate, first = ca.SX(der[state]), valid[: max(_SLOPE, valid.size // 16)]
             if rate.is_symbolic() and rate.name() in starts and first.size >= _SLOPE:
                 slope = np.polyfit(e.record.time[first], readings[first], 1)[0]
-                own[rate.name()] = float(slope) - starts[rate.name()]
-        found.append(own)
-    return found
+                item[rate.name()] = float(slope) - starts[rate.name()]
+        result.append(item)
+    return result
 
 
 def _drawn(p: Parameter, values: Mapping[str, float], rng: np.random.Generator) -> float:

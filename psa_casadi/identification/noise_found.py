@@ -15,18 +15,18 @@ from psa_casadi.units import BoolArray, FloatArray
 
 
 def noise_found(
-    fit: Fit, experiments: Sequence[Experiment], given: Sequence[Record | Signals] = ()
+    fit: Fit, experiments: Sequence[Experiment], arguments: Sequence[Record | Signals] = ()
 ) -> tuple[NoiseFound, ...]:
     """Return the kinds of noise in every output of every record, fitted and held-out samples.
 
-    The noise is that of the samples as they were `given`, not of averages or without outliers; the
+    The noise is that of the samples as they were measured, not of averages or without outliers; the
     prediction is a straight line between those of the experiments' samples. The model is simulated
     once more. Raises SimulationError where it cannot be.
     """
-    found = list[NoiseFound]()
-    for e, shown in zip(experiments, fit.shown(experiments), strict=True):
+    result = list[NoiseFound]()
+    for e, displayed in zip(experiments, fit.shown(experiments), strict=True):
         times = e.record.time
-        whole = next((r for r in given if _holds(r, e)), e.record)
+        whole = next((r for r in arguments if _holds(r, e)), e.record)
         inside = (whole.time >= times[0]) & (whole.time <= times[-1])
         time = whole.time[inside]
         named = [c for n in fit.model.input_names if (c := whole.column(n)) is not None]
@@ -34,20 +34,20 @@ def noise_found(
         near = np.searchsorted(0.5 * (times[1:] + times[:-1]), time)
         for j, channel in enumerate(e.channels):
             reading = whole.column(channel.column)
-            if reading is None or not np.isfinite(shown[:, j]).any():
+            if reading is None or not np.isfinite(displayed[:, j]).any():
                 continue
-            y = np.interp(time, times, shown[:, j])
+            y = np.interp(time, times, displayed[:, j])
             inputs = sorted(moving, key=lambda u: -_correlation(u, y))
             used = _used(e, j)[near]
             kinds = noise_kinds(time, reading[inside], y, inputs, used)
-            found.append(NoiseFound(e.record.name, channel.column, channel.unit, kinds))
-    return tuple(found)
+            result.append(NoiseFound(e.record.name, channel.column, channel.unit, kinds))
+    return tuple(result)
 
 
 def _holds(record: Record | Signals, e: Experiment) -> bool:
     """Whether an experiment's record was made of a record: of its file, within its time."""
-    begins, ends = e.record.time[0], e.record.time[-1]
-    within = record.time[0] <= begins and ends <= record.time[-1]
+    starts, ends = e.record.time[0], e.record.time[-1]
+    within = record.time[0] <= starts and ends <= record.time[-1]
     return bool(record.sha256 == e.record.sha256 and within)
 
 

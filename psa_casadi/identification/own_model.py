@@ -54,43 +54,47 @@ def identify_ode(
     be simulated at its values.
     """
     refuse_unfit(model)
-    given = given_to(model, records, hold)
+    signals = given_to(model, records, hold)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
-    *_, (best, runs, outcomes, said) = ways(
-        model, given,
+    *_, (best, runs, outcomes, statement) = ways(
+        model, signals,
         lambda length: experiments_of(
-            model, cut(model, given, length), judged=False, zeros=shifted, known_start=known_start
+            model, cut(model, signals, length), judged=False, zeros=shifted, known_start=known_start
         ),
         free_of(model, free), undecided=undecided(records, hold), starts=starts, progress=progress,
     )  # fmt: skip
-    found = determinacy(best, runs)
+    matches = determinacy(best, runs)
     result = Identification(
         model=with_told(
-            best.model, [e.record for e in runs], found.names, found.intervals,
+            best.model, [e.record for e in runs], matches.names, matches.intervals,
             force_scale="given", interrupted=best.interrupted,
         ),
         fit=best,
-        determinacy=found,
+        determinacy=matches,
         experiments=runs,
         doubts=(),
         starts=outcomes,
         interrupted=best.interrupted,
     )  # fmt: skip
-    doubts = *doubts_of(best, found, outcomes), *_of_outputs(result), *told_of_columns(model, runs)
-    noise = () if best.interrupted else noise_found(best, runs, given)
-    return replace(result, doubts=doubts, notes=(*said, *notes_of(noise)), noise_kinds=noise)
+    doubts = (
+        *doubts_of(best, matches, outcomes),
+        *_of_outputs(result),
+        *told_of_columns(model, runs),
+    )
+    noise = () if best.interrupted else noise_found(best, runs, signals)
+    return replace(result, doubts=doubts, notes=(*statement, *notes_of(noise)), noise_kinds=noise)
 
 
-def _of_outputs(found: Identification) -> list[Note]:
+def _of_outputs(identification: Identification) -> list[Note]:
     """Return which outputs a model misses, and which it does not follow at all."""
-    said, rms = [], found.rms
-    for o in found.fit.channels:
-        left, noise = rms[o.column], found.noise[o.column]
-        parts = [e.measured(o.number)[e.at(o.number)] for e in found.experiments]
+    notes, rms = [], identification.rms
+    for o in identification.fit.channels:
+        left, noise = rms[o.column], identification.noise[o.column]
+        parts = [e.measured(o.number)[e.at(o.number)] for e in identification.experiments]
         share = left / float(np.std(np.concatenate(parts)))
         if noise > 0 and left > MISSED * noise:
-            said.append(note("output_missed", output=o.column, ratio=left / noise))
+            notes.append(note("output_missed", output=o.column, ratio=left / noise))
         if share > _ALL:
-            said.append(note("output_not_followed", output=o.column, share=share))
-    return said
+            notes.append(note("output_not_followed", output=o.column, share=share))
+    return notes

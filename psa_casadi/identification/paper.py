@@ -82,14 +82,14 @@ def find_steps(records: Sequence[Record]) -> list[Step]:
 
     A step has two levels of voltage and a rise between them that takes less than 5 % of the hold.
     """
-    found = [s for r in records if (s := _step_of(r)) is not None]
-    return sorted(found, key=lambda s: abs(s.volts))
+    items = [s for r in records if (s := _step_of(r)) is not None]
+    return sorted(items, key=lambda s: abs(s.volts))
 
 
 def find_loops(records: Sequence[Record]) -> list[Loop]:
     """Return the records whose voltage goes up and down at even intervals, the slowest first."""
-    found = [loop for r in records if (loop := _loop_of(r)) is not None]
-    return sorted(found, key=lambda loop: loop.frequency)
+    items = [loop for r in records if (loop := _loop_of(r)) is not None]
+    return sorted(items, key=lambda loop: loop.frequency)
 
 
 def _step_of(record: Record) -> Step | None:
@@ -162,19 +162,19 @@ def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
 
     They are found by its iterated integrals.
     """
-    found = moment_coefficients(step.time, step.g)
+    values = moment_coefficients(step.time, step.g)
     kept = step.time <= (1.0 - _CUT) * step.time[-1]
     other = moment_coefficients(step.time[kept], step.g[kept])
-    change = np.abs(other - found) / np.maximum(np.abs(found), 1e-300)
+    change = np.abs(other - values) / np.maximum(np.abs(values), 1e-300)
     worst, notes = int(np.argmax(change)), []
     if change[worst] > _STEADY:
         reasons, name = _reasons(step) or [("short", 0.0)], COEFFICIENTS[worst]
         notes.append(
             note("window", name=step.name, coefficient=name, change=change[worst], reasons=reasons)
         )
-    wrong = [name for name, value in zip(COEFFICIENTS, found, strict=True) if not value > 0.0]
+    wrong = [name for name, value in zip(COEFFICIENTS, values, strict=True) if not value > 0.0]
     notes += [note("signs", names=wrong)] if wrong else []
-    return dict(zip(COEFFICIENTS, found.tolist(), strict=True)), notes
+    return dict(zip(COEFFICIENTS, values.tolist(), strict=True)), notes
 
 
 def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
@@ -208,8 +208,8 @@ def coefficients_of_limits(limits: FloatArray) -> FloatArray:
             matrix[i - 1, j - 1] = (-1) ** (j - 1) * k[i - j]
     matrix[0, 5] = -1.0
     scaled = np.linalg.lstsq(matrix, k[1:], rcond=None)[0]
-    found: FloatArray = scaled * unit ** np.array([1.0, 2.0, 3.0, 4.0, 5.0, 1.0])
-    return found
+    values: FloatArray = scaled * unit ** np.array([1.0, 2.0, 3.0, 4.0, 5.0, 1.0])
+    return values
 
 
 def _reasons(step: Step) -> list[tuple[str, float]]:
@@ -262,9 +262,9 @@ def mechanics_of(
         count = int(np.sum(roots.real >= 0.0))
         return alone, (note("growing_poles", count=count),)
     stiffness = np.array([1.0, k_P, k_P, k_B, k_B])
-    found = [dict(zip(_FACTORS, stiffness * f, strict=True)) for f in readings(roots)]
+    items = [dict(zip(_FACTORS, stiffness * f, strict=True)) for f in readings(roots)]
     ranked = []
-    for values in found:
+    for values in items:
         zero = (values["c_B"] + values["c_P"]) / (k_B + k_P)
         off = round(abs(zero - b_1) / max(abs(b_1), 1e-12), 6)
         ranked.append((off, -values["tau"], zero, values))
@@ -361,8 +361,8 @@ def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
     ]
     signs = [float(np.sign(np.mean(u_rate[branch]))) for branch in branches]
     rough = note("rough_velocity", loop=loop.name, share=100.0 * _QUIET * excess)
-    found = Rates(u, u_rate, h, h_rate, list(zip(signs, branches, strict=True)))
-    return found, [rough] if excess > _TOO_MUCH else []
+    rates = Rates(u, u_rate, h, h_rate, list(zip(signs, branches, strict=True)))
+    return rates, [rough] if excess > _TOO_MUCH else []
 
 
 #: Samples count in (31), (34) where h and |u'| exceed this share of their largest values.
@@ -414,12 +414,12 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     """
     differentiated = [rates_of(loop, k) for loop in loops]
     rates = [r for r, _ in differentiated]
-    notes = [note for _, own in differentiated for note in own]
+    notes = [note for _, item in differentiated for note in item]
     crossed = [[(sign, _crossing(r, b)) for sign, b in r.branches] for r in rates]
-    pairs = [pair for own in crossed for pair in _periods(own)]
+    pairs = [pair for item in crossed for pair in _periods(item)]
     if not pairs:
-        seen = {sign for own in crossed for sign, at in own if at is not None}
-        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in seen]
+        observed = {sign for item in crossed for sign, at in item if at is not None}
+        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in observed]
         return HysteresisPart(notes=(*notes, note("no_crossing", branches=missing)))
     # eq. (29) less k u': h'_+ = A_i u'_+ + delta_i u_+,  h'_- = A_i u'_- - delta_i u_-
     each = np.array([_solved(up, down) for up, down in pairs])
@@ -591,8 +591,8 @@ def in_forces(
             instead = kept.get(name, usual.values[name])
             notes.append(note("out_of_range", name=name, value=value, instead=instead,
                               unit=parameter.unit, low=low, high=high))  # fmt: skip
-    found = tuple(name for name in start.parameter_names if name in kept)
-    return usual.with_values(kept), found, notes
+    result = tuple(name for name in start.parameter_names if name in kept)
+    return usual.with_values(kept), result, notes
 
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
@@ -635,9 +635,9 @@ def paper_method(
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    model, found, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
-    told = (*doubts, *conditions(step, slowest, linear), *bend.notes, *notes)
-    return PaperIdentification(linear, k, model, found, told)
+    model, result, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
+    output = (*doubts, *conditions(step, slowest, linear), *bend.notes, *notes)
+    return PaperIdentification(linear, k, model, result, output)
 
 
 def identify_by_paper(
@@ -654,7 +654,7 @@ def identify_by_paper(
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
     experiments = tuple(whole(r) for r in records)
-    sigma, doubts, found = noise_levels(experiments), paper.notes, paper.found
+    sigma, doubts, result = noise_levels(experiments), paper.notes, paper.found
     progress("the model on all records")
     try:
         best = fit(paper.model, experiments, [], sigma=sigma)
@@ -663,10 +663,10 @@ def identify_by_paper(
     except PsaError:
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
-        doubts, found = (*doubts, note("runs_away")), ()
+        doubts, result = (*doubts, note("runs_away")), ()
     nothing = determinacy(best, experiments)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
-    notes = (*model.provenance.notes, str(note("paper", names=found)))
+    notes = (*model.provenance.notes, str(note("paper", names=result)))
     provenance = replace(model.provenance, notes=notes)
     return StackIdentification(
         model=replace(model, provenance=provenance),
@@ -674,7 +674,7 @@ def identify_by_paper(
         determinacy=nothing,
         experiments=experiments,
         doubts=doubts,
-        read_off=found,
+        read_off=result,
     )
 
 

@@ -53,7 +53,7 @@ Found = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note,
 
 def ways(
     model: Model,
-    given: Sequence[Signals],
+    signals: Sequence[Signals],
     made: Made,
     free: Sequence[str],
     *,
@@ -63,7 +63,7 @@ def ways(
 ) -> Iterator[Found]:
     """Yield the best fit of whole records, and that of parts where these may be better.
 
-    `made` turns the records that were `given` into experiments, `cut` into parts or not. Where it
+    `made` turns the records that were `signals` into experiments, `cut` into parts or not. Where it
     is `undecided` what inputs do between samples, it is what is likelier. Whole records are left
     out where they cannot be simulated, an error grows too much in them or the fit shows nothing of
     an output, but where parts are no better. Raises SimulationError where neither whole records
@@ -89,9 +89,9 @@ def ways(
     progress("fitting parts of the records")
     if dear and lost is None and follows(best, whole, NEAR):
         starts = 1
-    found = _in_parts(model, given, made, free, undecided, starts, progress)
-    if found is not None and (lost or len(found[1]) > len(whole) or _nearer(found[0], best)):
-        yield found
+    result = _in_parts(model, signals, made, free, undecided, starts, progress)
+    if result is not None and (lost or len(result[1]) > len(whole) or _nearer(result[0], best)):
+        yield result
     elif lost is not None:
         raise lost
     elif not usable:
@@ -103,8 +103,8 @@ def _as_read(
 ) -> Found:
     if best.interrupted:
         return best, whole, outcomes, ()
-    best, whole, said = read_otherwise(best, whole, undecided=undecided)
-    return best, whole, outcomes, said
+    best, whole, statement = read_otherwise(best, whole, undecided=undecided)
+    return best, whole, outcomes, statement
 
 
 def _nearer(one: Fit, other: Fit) -> bool:
@@ -116,18 +116,18 @@ def _nearer(one: Fit, other: Fit) -> bool:
 def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
     for o in of.channels:
-        shown = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
+        displayed = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
         noise = np.concatenate(
             [np.full(len(p), first_order_noise(p)[0]) for p in o.parts if p.size]
         )
         least = MISSED * float(np.sqrt(np.mean(noise**2)))
-        if o.rms > max(share * float(np.std(shown)), least):
+        if o.rms > max(share * float(np.std(displayed)), least):
             return False
     return True
 
 
 def _in_parts(
-    model: Model, given: Sequence[Signals], made: Made, free: Sequence[str], undecided: bool,
+    model: Model, signals: Sequence[Signals], made: Made, free: Sequence[str], undecided: bool,
     starts: int, progress: Progress,
 ) -> Found | None:  # fmt: skip
     """Return the fit of the longest parts that a model follows, or of whole records.
@@ -135,45 +135,49 @@ def _in_parts(
     None where it follows none, and where it forgets how records began: what it misses is told as
     well of whole ones.
     """
-    shortest = _shortest(model, given, made, free, starts, progress)
+    shortest = _shortest(model, signals, made, free, starts, progress)
     if shortest is None:
         return None
     (best, parts, outcomes), length = shortest
-    best, parts, said = read_otherwise(best, parts, undecided=undecided)
+    best, parts, statement = read_otherwise(best, parts, undecided=undecided)
     hold = parts[0].record.hold
     progress("fitting longer parts")
     best, parts, reached = _longest(
-        best, parts, lambda n: read_like(made(n), hold, said), length, max(s.n for s in given)
+        best,
+        parts,
+        lambda n: read_like(made(n), hold, statement),
+        length,
+        max(s.n for s in signals),
     )
     if reached is not None:
         if begins_once(model) or forgets(best, parts):
             return None
-        lasts = reached * float(np.median([s.sample_time for s in given]))
-        said = (*said, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
-    return *levelled(best, parts), outcomes, said
+        lasts = reached * float(np.median([s.sample_time for s in signals]))
+        statement = (*statement, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
+    return *levelled(best, parts), outcomes, statement
 
 
 def _shortest(
-    model: Model, given: Sequence[Signals], made: Made, free: Sequence[str], starts: int,
+    model: Model, signals: Sequence[Signals], made: Made, free: Sequence[str], starts: int,
     progress: Progress,
 ) -> tuple[tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]], int] | None:  # fmt: skip
     """Return the search in short parts, shorter ones where a model does not follow, and samples."""
     most = _LEAST if begins_once(model) else _MOST
-    finest = max(_FEWEST, -(-sum(s.n for s in given) // most))
+    finest = max(_FEWEST, -(-sum(s.n for s in signals) // most))
     for length in (k * finest for k in _SHORT):
-        if 2 * length > max(s.n for s in given):
+        if 2 * length > max(s.n for s in signals):
             continue
         parts = made(length)
         try:
-            found = search_starts(
+            result = search_starts(
                 sized(model, parts), parts, free, starts=starts, progress=progress
             )
         except PsaError:
             continue
-        if found[0].interrupted:
+        if result[0].interrupted:
             return None
-        if follows(*found[:2]):
-            return found, length
+        if follows(*result[:2]):
+            return result, length
     return None
 
 
@@ -200,26 +204,26 @@ def begins_once(model: Model) -> bool:
     return model.structure.played is not None
 
 
-def cut(model: Model, given: Sequence[Signals], length: int | None) -> list[Signals]:
+def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Signals]:
     """Return records in parts of so many samples, the last one of up to half of them more.
 
     Only the first part of each for a model that begins once.
     """
     if length is None:
-        return list(given)
+        return list(signals)
     if begins_once(model):
-        return [s.slice(0, min(length, s.n)) for s in given]
-    found = []
-    for s in given:
-        begins = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2]
-        ends = [*begins[1:], s.n]
-        found += [s.slice(a, b) for a, b in zip(begins, ends, strict=True)] if ends[1:] else [s]
-    return found
+        return [s.slice(0, min(length, s.n)) for s in signals]
+    result = []
+    for s in signals:
+        items = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2]
+        ends = [*items[1:], s.n]
+        result += [s.slice(a, b) for a, b in zip(items, ends, strict=True)] if ends[1:] else [s]
+    return result
 
 
 def begun(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
     """Fit longer parts from where a fit of shorter ones stands. Raises SimulationError."""
-    known = {_place(e): own for e, own in zip(parts, of.starts(), strict=True)}
+    known = {_place(e): item for e, item in zip(parts, of.starts(), strict=True)}
     starts: list[Mapping[str, float]] = [known.get(_place(e), {}) for e in longer]
     sigma = [of.sigma[0]] * len(longer)
     return fit(
@@ -239,8 +243,8 @@ def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
     it, and in its last tenth.
     """
     for k, p in enumerate(of.predictions(parts, further=True)):
-        own = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
-        each = [p.further[o.channel.outputs[0]][1][:, own] for o in of.channels]
+        item = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
+        each = [p.further[o.channel.outputs[0]][1][:, item] for o in of.channels]
         size = np.max(np.abs(each), axis=2, initial=0.0)
         n = max(1, int(_END * size.shape[1]))
         spans = size[:, :n], size, size[:, -n:]
@@ -266,6 +270,6 @@ def forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
     """
     left = dict[str, float]()
     for e, (first, _, last) in zip(parts, _influences(of, parts), strict=True):
-        own = float(np.log(np.max(last / first)))
-        left[e.record.sha256] = left.get(e.record.sha256, 0.0) + own
+        item = float(np.log(np.max(last / first)))
+        left[e.record.sha256] = left.get(e.record.sha256, 0.0) + item
     return max(left.values()) < float(np.log(_FORGOTTEN))

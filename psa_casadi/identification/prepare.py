@@ -51,11 +51,11 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
     Outliers, drop-outs and a stuck sensor are masked; where the sampling is so fast that block
     averages lose nothing, they take the samples' place.
     """
-    found = suspects(record)
-    clean, clocks = on_one_clock(masked(record, found))
-    said: tuple[Note | str, ...] = (*found.notes(record.name), *clocks)
+    result = suspects(record)
+    clean, clocks = on_one_clock(masked(record, result))
+    statement: tuple[Note | str, ...] = (*result.notes(record.name), *clocks)
     shorter, averages = _averaged(clean)
-    return shorter, (*said, *averages)
+    return shorter, (*statement, *averages)
 
 
 def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
@@ -66,7 +66,7 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
     if sum(r.n for r in records) <= MOST:
         return list(records), []
     ready = [_averaged(r) for r in records]
-    return [r for r, _ in ready], [s for _, said in ready for s in said]
+    return [r for r, _ in ready], [s for _, statement in ready for s in statement]
 
 
 def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
@@ -99,29 +99,29 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
 
     Raises InputError for a column that the model cannot give, or that has samples missing.
     """
-    fitted, said, problems = [], [], []
-    for column, shown in COLUMNS.items():
-        given = [r for r in records if getattr(r, column) is not None]
-        if not given:
+    fitted, statement, problems = [], [], []
+    for column, displayed in COLUMNS.items():
+        items = [r for r in records if getattr(r, column) is not None]
+        if not items:
             continue
         wider, sensor = model, SENSORS.get(column)
         if sensor is not None and sensor.name not in (c.name for c in model.components):
             with suppress(InputError):  # where that finds nothing to show
                 wider = model.with_components((*model.components, sensor))
-        missing = [o for o in shown.outputs if o not in wider.output_names]
+        missing = [o for o in displayed.outputs if o not in wider.output_names]
         if missing:
             problems.append(
                 f"The records have the column '{column}', but the model '{model.name}' does not"
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
-        elif why := _says_nothing(column, given):
-            said.append(note(why, column=column))
+        elif why := _says_nothing(column, items):
+            statement.append(note(why, column=column))
         else:
             model = wider
             fitted.append(column)
     if problems:
         raise InputError(problems)
-    return Columns(model, tuple(fitted), tuple(said))
+    return Columns(model, tuple(fitted), tuple(statement))
 
 
 def with_levels(
@@ -130,8 +130,8 @@ def with_levels(
     """Return the experiments with first noise levels of the columns that are fitted."""
     levels = []
     for column in columns:
-        own = [e for e in experiments if e.record.column(column) is not None and e.used.any()]
-        values = [getattr(e.record, column)[e.used] for e in own]
+        items = [e for e in experiments if e.record.column(column) is not None and e.used.any()]
+        values = [getattr(e.record, column)[e.used] for e in items]
         if values:
             noise = max(fast_noise(v) for v in values)
             spread = max(float(np.std(v)) for v in values)

@@ -50,9 +50,9 @@ class _HeldFits:
         """Return the value at a coordinate."""
         return float(np.exp(z)) if self.log else z
 
-    def z(self, found: Fit) -> float:
+    def z(self, result: Fit) -> float:
         """Return the coordinate of a fit."""
-        return self.coordinate(found.model.values[self.name])
+        return self.coordinate(result.model.values[self.name])
 
     def minimum(self, z: float, before: Fit) -> Fit | None:
         """Fit all other unknowns at z from the fit before; None if that cannot be simulated."""
@@ -60,7 +60,7 @@ class _HeldFits:
         value = float(np.clip(self.value(z), low, high))
         self._progress(f"profile of {self.name}, {value:.4g}")
         try:
-            found = fit(
+            result = fit(
                 self.best.model.with_values({self.name: value}), self.experiments, self._free,
                 sigma=self.best.sigma, start={n: before.model.values[n] for n in self._free},
                 start_states=before.starts(), evaluations=_EVALUATIONS,
@@ -68,16 +68,16 @@ class _HeldFits:
             )  # fmt: skip
         except PsaError:
             return None
-        if found.interrupted:
+        if result.interrupted:
             raise KeyboardInterrupt
-        return found
+        return result
 
     def side(self, centre: Fit, step: float, points: int) -> list[Fit]:
         """Return fits outwards from the centre until the limit is crossed or a bound is met."""
-        found, failures = [centre], 0
+        result, failures = [centre], 0
         edge = self.edges[1] if step > 0 else self.edges[0]
-        while len(found) <= points and failures < _RETRIES:
-            last = found[-1]
+        while len(result) <= points and failures < _RETRIES:
+            last = result[-1]
             here = self.z(last)
             outside = (here + step - edge) * step > 0
             z = edge if outside else here + step
@@ -87,30 +87,30 @@ class _HeldFits:
             if point is None:
                 failures, step = failures + 1, 0.3 * step
                 continue
-            found.append(point)
-            level = self._level(point, found)
+            result.append(point)
+            level = self._level(point, result)
             if level > 1.0:
-                return self._refined(found)[1:]
+                return self._refined(result)[1:]
             distance = abs(z - self.z(centre))  # the next level should be reached by proportion
             aim = _BEFORE if level < 0.5 * _BEFORE else _AT
-            flat = len(found) > 2 and level - self._level(last, found) < _FLAT
+            flat = len(result) > 2 and level - self._level(last, result) < _FLAT
             least, most = (2.0 if flat else 0.1) * abs(step), _GROWTH * distance
             wanted = distance * (aim / max(level, 1e-9) - 1.0)
             step = float(np.copysign(np.clip(wanted, min(least, most), most), z - self.z(centre)))
-        return found[1:]
+        return result[1:]
 
-    def _level(self, point: Fit, found: Sequence[Fit]) -> float:
+    def _level(self, point: Fit, fits: Sequence[Fit]) -> float:
         """Return sqrt(increase / limit), which grows in proportion to the distance at first."""
-        least = min(p.cost for p in found)
+        least = min(p.cost for p in fits)
         return float(np.sqrt(max(point.cost - least, 0.0) / self.limit))
 
-    def _refined(self, found: list[Fit]) -> list[Fit]:
+    def _refined(self, fits: list[Fit]) -> list[Fit]:
         """Put points where the limit should be crossed, until those around it are close."""
-        outer = found.pop()
+        outer = fits.pop()
         beyond = [outer]
         for _ in range(_RETRIES):
-            inner = found[-1]
-            levels = self._level(inner, found), self._level(outer, found)
+            inner = fits[-1]
+            levels = self._level(inner, fits), self._level(outer, fits)
             if levels[1] - levels[0] <= _FINE:
                 break
             # a cost that turns steep all at once would hold an interpolation back at the inside
@@ -119,12 +119,12 @@ class _HeldFits:
             middle = self.minimum(here + share * (self.z(outer) - here), inner)
             if middle is None:
                 break
-            if self._level(middle, found) > 1.0:
+            if self._level(middle, fits) > 1.0:
                 outer = middle
                 beyond.insert(0, middle)
             else:
-                found.append(middle)
-        return [*found, *beyond]
+                fits.append(middle)
+        return [*fits, *beyond]
 
 
 #: The 95 % quantile of chi-square with one degree of freedom.
@@ -191,8 +191,8 @@ def profile(
     first = spread / estimate if held.log else spread  # one standard error
     first = float(np.clip(first, 1e-6 * ordinary, ordinary))
     below, above = (held.side(centre, sign * first, points) for sign in (-1.0, 1.0))
-    found = [*below[::-1], centre, *above]
-    z, cost = (np.array([of(p) for p in found]) for of in (held.z, lambda p: p.cost))
+    items = [*below[::-1], centre, *above]
+    z, cost = (np.array([of(p) for p in items]) for of in (held.z, lambda p: p.cost))
     level: FloatArray = np.sqrt((cost - cost.min()) / held.limit)
     least = int(np.argmin(cost))
     ends = [
@@ -235,7 +235,7 @@ def _spread(best: Fit, experiments: Sequence[Experiment], name: str) -> tuple[fl
         float(gradient @ covariance_of(best, experiments, white=w) @ gradient)
         for w in (True, False)
     )
-    found = max(coloured, 1e-12 * white)
+    result = max(coloured, 1e-12 * white)
     # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
     rows = np.concatenate([residuals for _, residuals in weighted_rows(best, experiments)])
-    return float(np.sqrt(found)), max(found / white, float(np.mean(rows**2)))
+    return float(np.sqrt(result)), max(result / white, float(np.mean(rows**2)))

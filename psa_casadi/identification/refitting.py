@@ -108,9 +108,9 @@ def relevelled(
     """
     now, rounds = tuple(experiments), _ALL_ROUNDS if every else _LEVEL_ROUNDS
     for _ in range(rounds if best.further else int(every)):
-        told = best.channels if every else best.further
-        levels = [f.relevelled() for f in told]
-        pairs = zip(told, levels, strict=True)
+        output = best.channels if every else best.further
+        levels = [f.relevelled() for f in output]
+        pairs = zip(output, levels, strict=True)
         same = all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs)
         if best.interrupted or same:
             break
@@ -137,21 +137,21 @@ def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment,
     """
     shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
     whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
-    shown = fit.shown(experiments) if whole else []
+    displayed = fit.shown(experiments) if whole else []
     for o in fit.channels:
         j = o.number
-        rows = ((k, experiments[k], shown[k][:, j]) for k in whole)
-        begun = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
+        rows = ((k, experiments[k], displayed[k][:, j]) for k in whole)
+        started = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
         fitted = zip(o.records, o.parts, strict=True)
-        found = [(k, p) for k, p in (*fitted, *begun) if len(p) >= _TELLING]
-        if len(found) < 2:
+        items = [(k, p) for k, p in (*fitted, *started) if len(p) >= _TELLING]
+        if len(items) < 2:
             continue
-        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in found]
-        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in found])
-        for (k, part), own in zip(found, over, strict=True):
-            if abs(own) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
-                shares[k][j] *= float(np.exp(own))
-    return tuple(replace(e, noise=tuple(own)) for e, own in zip(experiments, shares, strict=True))
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in items]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in items])
+        for (k, part), item in zip(items, over, strict=True):
+            if abs(item) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][j] *= float(np.exp(item))
+    return tuple(replace(e, noise=tuple(item)) for e, item in zip(experiments, shares, strict=True))
 
 
 def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:

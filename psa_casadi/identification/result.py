@@ -62,7 +62,7 @@ class Identification(Reported):
 
     def __repr__(self) -> str:
         """Return the parameters with their standard errors, and what is left of the outputs."""
-        return str(note("own_identification", found=self))
+        return str(note("own_identification", identification=self))
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -119,8 +119,8 @@ class Identification(Reported):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of IDENTIFICATION.json."""
-        found: dict[str, Any] = made("identification_file", self)
-        return found
+        table: dict[str, Any] = made("identification_file", self)
+        return table
 
     def to_json(self) -> str:
         """Return the text of IDENTIFICATION.json."""
@@ -129,17 +129,17 @@ class Identification(Reported):
 
 def rms_left(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
     """Return what a fit leaves of every measured output over all records (rms), in its unit."""
-    found = {}
+    table = {}
     for o in fit.channels:
         rows = zip(o.records, o.parts, strict=True)
         left = np.concatenate([p * experiments[k].share(o.number) for k, p in rows])
-        found[o.column] = float(np.sqrt(np.mean(left**2)))
-    return found
+        table[o.column] = float(np.sqrt(np.mean(left**2)))
+    return table
 
 
 def doubts_of(
     fit: Fit,
-    found: Determinacy,
+    determinacy: Determinacy,
     starts: Sequence[StartOutcome],
     not_unique: Sequence[str] = (),
 ) -> list[Note]:
@@ -147,16 +147,16 @@ def doubts_of(
 
     `not_unique` names parameters that equally good fits differ in.
     """
-    said = []
+    items = []
     if fit.interrupted or not fit.converged:
-        said.append(note("interrupted" if fit.interrupted else "cut_off"))
+        items.append(note("interrupted" if fit.interrupted else "cut_off"))
     if not_unique:
-        said.append(note("not_unique", names=not_unique))
+        items.append(note("not_unique", names=not_unique))
     elif len(starts) > 1 and sum(bool(s.agrees) for s in starts) == 1:
-        said.append(note("one_start", starts=len(starts)))
-    said += [note("on_bound", name=name) for name in found.on_bound]
-    alone = [n for n in found.undetermined if n not in not_unique]
-    return [*said, note("undetermined", names=alone)] if alone else said
+        items.append(note("one_start", starts=len(starts)))
+    items += [note("on_bound", name=name) for name in determinacy.on_bound]
+    alone = [n for n in determinacy.undetermined if n not in not_unique]
+    return [*items, note("undetermined", names=alone)] if alone else items
 
 
 def with_told(
@@ -170,11 +170,11 @@ def with_told(
 
     `more` are other fields of `Provenance` by name.
     """
-    told = Provenance(
+    provenance = Provenance(
         identified_from=tuple((r.name, r.sha256) for r in records),
         package_version=__version__,
         free=tuple(free),
         intervals=intervals,
         **more,
     )
-    return replace(model, provenance=told, evidence=None)
+    return replace(model, provenance=provenance, evidence=None)

@@ -50,8 +50,8 @@ def smooth_between(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | N
     for e in experiments:
         # a sample is moved by the mean of the intervals on its sides
         higher = _higher(e.record)
-        beside = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
-        moved.append(replace(e, record=replace(e.record, voltage=e.record.voltage + beside)))
+        others = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
+        moved.append(replace(e, record=replace(e.record, voltage=e.record.voltage + others)))
     share, low, high = held
     return tuple(moved), note("smooth_voltage", share=share, low=low, high=high)
 
@@ -64,11 +64,11 @@ def even_clock(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
     """
     even = [_evened(e.record) for e in experiments]
     held = None
-    if any(own is not e.record for own, e in zip(even, experiments, strict=True)):
+    if any(item is not e.record for item, e in zip(even, experiments, strict=True)):
         held = _held(fit, experiments, _of_even)
     if held is None:
         return None
-    moved = tuple(replace(e, record=own) for e, own in zip(experiments, even, strict=True))
+    moved = tuple(replace(e, record=item) for e, item in zip(experiments, even, strict=True))
     late = np.concatenate(
         [new.record.time - e.record.time for new, e in zip(moved, experiments, strict=True)]
     )
@@ -93,11 +93,11 @@ def _held(
         return None
     basis, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     both = np.concatenate(parts), fit.residuals
-    own, left = (x - basis @ (basis.T @ x) for x in both)
-    power = float(own @ own)
+    item, left = (x - basis @ (basis.T @ x) for x in both)
+    power = float(item @ item)
     if power <= 0.0:
         return None
-    share, error = float(own @ left) / power, float(np.sqrt(np.mean(left**2) / power))
+    share, error = float(item @ left) / power, float(np.sqrt(np.mean(left**2) / power))
     if not (share > _SURE * error and abs(share - 1.0) < _NEAR):
         return None
     return share, share - 1.96 * error, share + 1.96 * error

@@ -134,32 +134,32 @@ def _search(
     """Search as `search` says; `keep` gets every fit that is better than those before it."""
     records = [e.record for e in fitted(experiments)]
     core = free_parameters(model, records)
-    told = resolved(model, linear, min(r.sample_time for r in records))
+    output = resolved(model, linear, min(r.sample_time for r in records))
     starts = starting_points(model, linear, records)
-    found = _quick_fits(model, experiments, [*core, *told], starts, progress, keep)
-    keep(found[0][1])
-    sigma = residual_noise(found[0][1], experiments)
+    result = _quick_fits(model, experiments, [*core, *output], starts, progress, keep)
+    keep(result[0][1])
+    sigma = residual_noise(result[0][1], experiments)
     polished: list[Fit] = []
-    for name, quick in found:
-        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * found[0][1].data_cost
+    for name, quick in result:
+        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * result[0][1].data_cost
         lost = all(f.data_cost > _MISSED * len(f.residuals) for f in polished)
-        missed = thorough and len(polished) < _FOLLOWED and lost
-        if polished and (polished[0].interrupted or not (missed or (near and len(polished) < 2))):
+        misfit = thorough and len(polished) < _FOLLOWED and lost
+        if polished and (polished[0].interrupted or not (misfit or (near and len(polished) < 2))):
             break
-        if polished and not thorough and same_place(found[0][1], quick, experiments):
+        if polished and not thorough and same_place(result[0][1], quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
         polished.append(ended)
         keep(min(polished, key=lambda f: f.data_cost))
     best = min(polished, key=lambda f: f.data_cost)
-    outcomes, not_unique = _outcomes(found, polished, best, experiments)
+    outcomes, not_unique = _outcomes(result, polished, best, experiments)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
-        tuned = retuned(best, experiments, progress) if told else best
+        tuned = retuned(best, experiments, progress) if output else best
         if tuned is not best:
             best = tuned
-            outcomes, not_unique = _outcomes(found, polished, best, experiments)
+            outcomes, not_unique = _outcomes(result, polished, best, experiments)
         keep(best)
         best = without_blur(best, experiments)
         keep(best)
@@ -171,14 +171,14 @@ def _search(
 
 
 def _outcomes(
-    found: Sequence[tuple[str, Fit]],
+    result: Sequence[tuple[str, Fit]],
     polished: Sequence[Fit],
     best: Fit,
     experiments: Sequence[Experiment],
 ) -> tuple[tuple[StartOutcome, ...], set[str]]:
     """Tell what became of every start, and which parameters equally good fits differ in."""
     outcomes, not_unique = [], set[str]()
-    for k, (name, quick) in enumerate(found):
+    for k, (name, quick) in enumerate(result):
         if k >= len(polished):
             outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
@@ -207,14 +207,14 @@ def _quick_fits(
         progress(f"base fit from {name}")
         return fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
 
-    found = sorted(fits_from(starts, begun), key=lambda pair: pair[1].data_cost)
-    for _, best in found[:1]:
+    items = sorted(fits_from(starts, begun), key=lambda pair: pair[1].data_cost)
+    for _, best in items[:1]:
         keep(best)
     widest = max(e.record.range_m for e in fitted(experiments))
     # a loop that diverges is left there, unless all do
-    found = [pair for pair in found if pair[1].rms < widest] or found
-    for k, (name, quick) in enumerate(found[: _FINALISTS if len(rounds) > 1 else 0]):
-        if any(f.interrupted for _, f in found):
+    items = [pair for pair in items if pair[1].rms < widest] or items
+    for k, (name, quick) in enumerate(items[: _FINALISTS if len(rounds) > 1 else 0]):
+        if any(f.interrupted for _, f in items):
             break
         progress(f"base fit from {name}, continued")
         states = quick.starts()
@@ -223,13 +223,13 @@ def _quick_fits(
                 quick.model, experiments, free, start_states=states, evaluations=rounds[1],
                 **quickly,
             )  # fmt: skip
-            found[k] = (name, further)
-    if not found:
+            items[k] = (name, further)
+    if not items:
         raise PsaError(
             "The base model could not be simulated from any start; the voltage's unit or the"
             " displacement's sign is the likely cause: check the record."
         )
-    return sorted(found, key=lambda pair: pair[1].data_cost)
+    return sorted(items, key=lambda pair: pair[1].data_cost)
 
 
 _LABELS = {FORMS["bouc-wen"].name: "Bouc-Wen", FORMS["spectrum"].name: "a spectrum of elements"}
@@ -249,7 +249,7 @@ def search_forms(
     r's residual, k the parameters, n the samples (Schwarz, Annals of Statistics 6 (1978) 461). None
     for one model. Raises PsaError where no model can be fitted.
     """
-    found: list[Search] = []
+    searches: list[Search] = []
     failed: list[PsaError] = []
     for model in models:
         try:
@@ -257,10 +257,10 @@ def search_forms(
         except PsaError as error:
             failed.append(error)
             continue
-        found.append(one)
+        searches.append(one)
         if one.best.interrupted:
             break
-    if not found:
+    if not searches:
         raise failed[0]
     samples = [int(e.used.sum()) for e in experiments]
 
@@ -269,15 +269,15 @@ def search_forms(
         likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
         return float(likely + len(s.best.unknowns.names) * np.log(sum(samples)))
 
-    ranked = sorted(found, key=criterion)
+    ranked = sorted(searches, key=criterion)
     if len(ranked) < 2:
         return ranked[0], None
     forms = [
         next(_LABELS[c.name] for c in s.best.model.components if c.name in _LABELS) for s in ranked
     ]
     left, other_left = (1e9 * s.best.rms for s in ranked)
-    said = note("form", better=forms[0], left=left, other=forms[1], other_left=other_left)
-    return ranked[0], said
+    statement = note("form", better=forms[0], left=left, other=forms[1], other_left=other_left)
+    return ranked[0], statement
 
 
 #: The column, and the highest order of the curve.
@@ -322,22 +322,22 @@ def loads_as_curves(
     as_displacement = []  # the load, to the size and sign of the displacement
     for e, load in zip(experiments, loads, strict=True):
         y = np.asarray(e.record.displacement)
-        seen, span = np.isfinite(y), max(float(np.ptp(load)), 1e-300)
-        sign = np.sign(np.cov(load[seen], y[seen])[0, 1]) or 1.0
-        shown = np.where(seen, load * sign * e.record.range_m / span, np.nan)
-        record = replace(e.record, displacement=shown, load_force=None)
+        observed, span = np.isfinite(y), max(float(np.ptp(load)), 1e-300)
+        sign = np.sign(np.cov(load[observed], y[observed])[0, 1]) or 1.0
+        text = np.where(observed, load * sign * e.record.range_m / span, np.nan)
+        record = replace(e.record, displacement=text, load_force=None)
         as_displacement.append(replace(e, record=record).beside(()))
     ways = [
-        fit_base(start, own, progress=progress).predicted(own)
-        for own in (unloaded, tuple(as_displacement))
+        fit_base(start, item, progress=progress).predicted(item)
+        for item in (unloaded, tuple(as_displacement))
     ]
-    curves = [_curve(load, own) for load, *own in zip(loads, *ways, strict=True)]
+    curves = [_curve(load, item) for load, *item in zip(loads, *ways, strict=True)]
     straight = all(c is not None and c[1] == 1 for c in curves)
-    found = []
-    for e, load, own in zip(experiments, loads, curves, strict=True):
-        curve = np.zeros(e.record.n) if straight else load if own is None else own[0]
-        found.append(replace(e, record=replace(e.record, load_force=curve)))
-    return tuple(found)
+    items = []
+    for e, load, item in zip(experiments, loads, curves, strict=True):
+        curve = np.zeros(e.record.n) if straight else load if item is None else item[0]
+        items.append(replace(e, record=replace(e.record, load_force=curve)))
+    return tuple(items)
 
 
 def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, int] | None:
@@ -345,7 +345,7 @@ def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, in
 
     Over one of the displacements x (n,) [m]; of the smallest n ln S + order ln n (Schwarz 1978).
     """
-    found = []
+    items = []
     for x in ways:
         middle, half = 0.5 * (float(x.max()) + float(x.min())), 0.5 * float(np.ptp(x))
         powers = np.polynomial.chebyshev.chebvander((x - middle) / max(half, 1e-300), _ORDER)
@@ -353,8 +353,8 @@ def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, in
             columns = powers[:, : order + 1]
             curve = columns @ np.linalg.lstsq(columns, load, rcond=None)[0]
             left = max(float(np.sum((load - curve) ** 2)), 1e-300)
-            found.append((load.size * np.log(left) + order * np.log(load.size), order, curve))
-    _, order, curve = min(found, key=lambda f: f[0])
-    missed = float(np.std(load - curve))
+            items.append((load.size * np.log(left) + order * np.log(load.size), order, curve))
+    _, order, curve = min(items, key=lambda f: f[0])
+    misfit = float(np.std(load - curve))
     allowed = np.hypot(_NOISE * high_frequency_noise(load), _SHARE * float(np.ptp(load)))
-    return (curve, order) if missed <= allowed else None
+    return (curve, order) if misfit <= allowed else None

@@ -168,8 +168,8 @@ class Model(Celled):
 
     def with_declared_starts(self) -> "Model":
         """Return the model with the start values that its components declare."""
-        own = self.own_starts()
-        return replace(self, structure=structure_of(self.components)) if own else self
+        values = self.own_starts()
+        return replace(self, structure=structure_of(self.components)) if values else self
 
     def with_starts(self, starts: Mapping[str, float]) -> "Model":
         """Return the model with other start values of states and inputs (SI units).

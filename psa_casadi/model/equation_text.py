@@ -134,18 +134,18 @@ def _constant(value: float) -> ast.expr:
     return ast.UnaryOp(ast.USub(), size) if value < 0 else size
 
 
-def _tree(operation: str, given: list[ast.expr]) -> ast.expr:
+def _tree(operation: str, inputs: list[ast.expr]) -> ast.expr:
     if operation in _SIGNS:
-        return ast.BinOp(given[0], _SIGNS[operation](), given[1])
+        return ast.BinOp(inputs[0], _SIGNS[operation](), inputs[1])
     if operation in _RELATIONS:
-        return ast.Compare(given[0], [_RELATIONS[operation]()], given[1:])
+        return ast.Compare(inputs[0], [_RELATIONS[operation]()], inputs[1:])
     if operation in _CONNECTED:
-        return ast.BoolOp(_CONNECTED[operation](), given)
+        return ast.BoolOp(_CONNECTED[operation](), inputs)
     if operation in ("neg", "not"):
-        return ast.UnaryOp(ast.USub() if operation == "neg" else ast.Not(), given[0])
+        return ast.UnaryOp(ast.USub() if operation == "neg" else ast.Not(), inputs[0])
     if operation == "if":
-        operation, given = "if_else", [*given, ast.Constant(0)][:3]
-    return ast.Call(ast.Name(operation), given, [])
+        operation, inputs = "if_else", [*inputs, ast.Constant(0)][:3]
+    return ast.Call(ast.Name(operation), inputs, [])
 
 
 def equations_of(texts: EquationTexts, place: str) -> KeptEquations:
@@ -154,20 +154,20 @@ def equations_of(texts: EquationTexts, place: str) -> KeptEquations:
     Raises InputError with a sentence for each mistake, which begins with its place in the file.
     """
     problems, reader = Problems(), _Reader()
-    found: dict[tuple[str, str], Expression] = {}
+    expressions: dict[tuple[str, str], Expression] = {}
     for (part, name), text in texts.every.items():
         try:
             value = reader.expression(text)
             if part == "where":
                 reader.define(name, value)
             else:
-                found[part, name] = value
+                expressions[part, name] = value
         except ValueError as error:
             problems.add(f"'{place}.{part}.{name[:80]}' {error}")
     problems.raise_if_any()
     symbols = reader.symbols
-    function = ca.Function("equations", list(symbols.values()), list(found.values()))
-    return KeptEquations(function, tuple(symbols), tuple(found))
+    function = ca.Function("equations", list(symbols.values()), list(expressions.values()))
+    return KeptEquations(function, tuple(symbols), tuple(expressions))
 
 
 class _Reader:
@@ -238,8 +238,8 @@ class _Reader:
         return self.symbols[name]
 
 
-def _folded(connect: Callable[..., Expression], *given: Expression) -> Expression:
-    return reduce(connect, given)
+def _folded(connect: Callable[..., Expression], *expressions: Expression) -> Expression:
+    return reduce(connect, expressions)
 
 
 def _function(name: str, count: int) -> Callable[..., Expression]:
@@ -248,8 +248,8 @@ def _function(name: str, count: int) -> Callable[..., Expression]:
         known = ", ".join(f"{n} ({k})" for n, k in FUNCTIONS.items())
         raise ValueError(f"calls {name[:80]} of {count}; the functions (of how many) are {known}.")
     if name in _COMPOSED:
-        found: Callable[..., Expression] = getattr(ca, name)
-        return found
+        result: Callable[..., Expression] = getattr(ca, name)
+        return result
     return partial((ca.SX.unary, ca.SX.binary)[count - 1], getattr(ca, f"OP_{name.upper()}"))
 
 

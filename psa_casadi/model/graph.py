@@ -100,14 +100,14 @@ class ExpressionGraph:
 
     def below(self, roots: Iterable[int]) -> set[int]:
         """Return the numbers of the roots and of all that they are made of."""
-        found: set[int] = set()
+        numbers: set[int] = set()
         waiting = list(roots)
         while waiting:
             number = waiting.pop()
-            if number not in found:
-                found.add(number)
+            if number not in numbers:
+                numbers.add(number)
                 waiting.extend(self.nodes[number].arguments)
-        return found
+        return numbers
 
     def _operation(self, code: int, arguments: list[int]) -> int:
         """Return the number of one of CasADi's operations, reduced to those that are printed."""

@@ -104,7 +104,7 @@ def dumps(model: Model) -> str:
     what it declares. Raises InputError for equations that no text can have, two components of
     one name, and numbers and texts that no file can carry.
     """
-    origin, own = model.provenance, _written(model)
+    origin, item = model.provenance, _written(model)
     parameters = {
         p.name: {
             "value": model.values[p.name],
@@ -126,7 +126,7 @@ def dumps(model: Model) -> str:
             for c in model.effects
         ],
         "parameters": parameters,
-        **({"own": plain(own)} if own else {}),
+        **({"own": plain(item)} if item else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
@@ -148,20 +148,20 @@ def _written(model: Model) -> dict[str, OwnComponent]:
     """Return what the file has of components that are in no table and of no module, by name."""
     known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
     about = f"The model {shown(model.name)} cannot be saved as MODEL.json:"
-    problems, found = Problems(), dict[str, OwnComponent]()
+    problems, result = Problems(), dict[str, OwnComponent]()
     for name, count in Counter(c.name for c in model.components).items():
         if count > 1:
             problems.add(f"{about} {count} components are named '{name}'; rename them.")
     try:
         for component in model.components:
             if component not in known and not component.home:
-                found[component.name] = written(component, model.values)
-        refuse_large(found.values())
+                result[component.name] = written(component, model.values)
+        refuse_large(result.values())
     except InputError as error:
         for problem in error.problems:
             problems.add(f"{about} {problem}")
     problems.raise_if_any()
-    return found
+    return result
 
 
 def no_fmu(used: FmuUsed, name: str, parameters: tuple[Parameter, ...]) -> Component:
@@ -188,26 +188,26 @@ def model_of(
     `opener` returns the component of an FMU that it has. Raises InputError that names every unknown
     name, missing or bad value.
     """
-    found = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if not isinstance(content, dict) or found != FORMAT:
+    result = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if not isinstance(content, dict) or result != FORMAT:
         raise InputError(
-            f"{source} is not a model file: its format is {shown(found)}, expected '{FORMAT}';"
+            f"{source} is not a model file: its format is {shown(result)}, expected '{FORMAT}';"
             f" {_ADVICE}"
         )
     declared = part(Mapping[str, OwnComponent], content.get("own", {})) or {}
     try:
-        own = components_of(declared, opener)
+        item = components_of(declared, opener)
     except InputError as error:
         _refuse(error.problems, source)
         raise
-    table = {**COMPONENTS, **own}, {**known_effects(effects), **_BESIDE, **own}
+    table = {**COMPONENTS, **item}, {**known_effects(effects), **_BESIDE, **item}
     _refuse(_problems(content, *table), source)
     file = decode(ModelFile, content, source)
     components = [table[0][name] for name in file.components]
     components += [table[1][_name_of(effect)] for effect in file.effects]
-    given = file.parameters
+    inputs = file.parameters
     try:
-        values = {name: p.value for name, p in given.items()}
+        values = {name: p.value for name, p in inputs.items()}
         model = compose(components, values, name=file.name, description=file.description)
         model = model.with_starts(file.starts)
     except InputError as error:
@@ -215,7 +215,7 @@ def model_of(
         raise
     if file.evidence is not None:
         _refuse(contradictions(file.evidence, model.values), source)
-    ordered = {p.name: given[p.name] for p in model.structure.parameters}
+    ordered = {p.name: inputs[p.name] for p in model.structure.parameters}
     provenance = Provenance(
         identified_from=tuple((r.record, r.sha256) for r in file.identified_from),
         package_version=file.package_version,
@@ -280,10 +280,10 @@ def _problems(
         problems += [
             f"'publication.{n[:80]}' is unknown; give {', '.join(_STATED)}." for n in extra
         ]
-    if isinstance(given := content.get("parameters"), dict):
-        problems += _parameter_problems(given, known)
+    if isinstance(inputs := content.get("parameters"), dict):
+        problems += _parameter_problems(inputs, known)
         declared = {p.name for c in known for p in c.parameters}
-        unknown = [n for n in given if n not in declared]
+        unknown = [n for n in inputs if n not in declared]
         if unknown and not problems:
             problems.append(
                 f"unknown parameters {shown(unknown)}; remove them or add their component."
@@ -292,7 +292,7 @@ def _problems(
 
 
 def _listed(content: dict[str, Any], key: str) -> list[Any]:
-    return found if isinstance(found := content.get(key), list) else []
+    return result if isinstance(result := content.get(key), list) else []
 
 
 def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component]) -> str:
@@ -306,12 +306,12 @@ def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component
     )
 
 
-def _parameter_problems(given: dict[str, Any], known: Iterable[Component]) -> Iterator[str]:
+def _parameter_problems(table: dict[str, Any], known: Iterable[Component]) -> Iterator[str]:
     for parameter in {p.name: p for c in known for p in c.parameters}.values():
-        if parameter.name not in given:
+        if parameter.name not in table:
             yield f"parameter '{parameter.name}' [{parameter.unit}] has no value; add it."
             continue
-        entry = part(ModelParameter, given[parameter.name])
+        entry = part(ModelParameter, table[parameter.name])
         if entry and entry.unit not in ("", parameter.unit):
             yield (
                 f"'{parameter.name}' is given in {shown(entry.unit)}; convert it to"

@@ -82,8 +82,8 @@ def ode_model(
     leave it open; intermediates that need each other.
     """
     f, names = _read(ode)
-    given = {"x": states, "u": inputs, "p": parameters, "y": outputs, "w": intermediates}
-    table = _declared(f, names, given, values or {}, name)
+    arguments = {"x": states, "u": inputs, "p": parameters, "y": outputs, "w": intermediates}
+    table = _declared(f, names, arguments, values or {}, name)
     equations = _equations(f, table)
     written = equations(OnDemand())
     lines = [f"{state}' = {side}" for state, side in written.der.items()]
@@ -116,9 +116,9 @@ def _read(
         columns = {k: ca.MX.sym(k, *ode.size_in(i)) for i, k in enumerate(inputs)}
         columns |= dict(zip(outputs, ode.call([columns[k] for k in inputs]), strict=True))
     elif isinstance(ode, Mapping):
-        given = {_ALIASES.get(k, k): v for k, v in ode.items()}
-        _check_names(list(given), "The ODE")
-        kinds = {k: type(v).__name__ for k, v in given.items() if isinstance(v, ca.SX | ca.MX)}
+        table = {_ALIASES.get(k, k): v for k, v in ode.items()}
+        _check_names(list(table), "The ODE")
+        kinds = {k: type(v).__name__ for k, v in table.items() if isinstance(v, ca.SX | ca.MX)}
         if len(set(kinds.values())) > 1:
             listed = ", ".join(f"'{k}' is {kind}" for k, kind in sorted(kinds.items()))
             raise InputError(
@@ -126,7 +126,7 @@ def _read(
                 " with casadi.SX.sym, or all with casadi.MX.sym."
             )
         kind = ca.MX if "MX" in kinds.values() else ca.SX
-        columns = {k: _column(k, v, kind) for k, v in given.items()}
+        columns = {k: _column(k, v, kind) for k, v in table.items()}
     else:
         raise InputError(
             f"The ODE is a {type(ode).__name__}; give a mapping such as"
@@ -136,12 +136,12 @@ def _read(
     names: dict[str, list[str]] = {k: [] for k in SYMBOLS}
     for k in SYMBOLS:
         for symbol in ca.symvar(columns[k]) if k in columns else ():
-            own, count = symbol.name(), symbol.numel()
-            names[k] += [own] if count == 1 else [f"{own}_{i}" for i in range(count)]
+            item, count = symbol.name(), symbol.numel()
+            names[k] += [item] if count == 1 else [f"{item}_{i}" for i in range(count)]
     whole = {"t": kind.sym("t"), **columns}
     before, after = ([whole.get(k, kind(0, 1)) for k in q] for q in (SYMBOLS, EXPRESSIONS))
-    found = _scalar(ca.Function("ode", before, after, list(SYMBOLS), list(EXPRESSIONS)))
-    return _without_algebra(found), names
+    function = _scalar(ca.Function("ode", before, after, list(SYMBOLS), list(EXPRESSIONS)))
+    return _without_algebra(function), names
 
 
 def _check_names(names: list[str], what: str) -> None:
@@ -253,7 +253,7 @@ def _without_algebra(f: ca.Function) -> ca.Function:
     An intermediate that depends on them stands in these equations as what it is defined as.
     """
     *known, w, z = f.sx_in()
-    *found, wdef, alg = f(*known, w, z)
+    *result, wdef, alg = f(*known, w, z)
     if z.numel():
         follows, of = ca.SX(z), [ca.SX(0, 1)] * 2
         for _ in range(w.numel()):
@@ -272,15 +272,15 @@ def _without_algebra(f: ca.Function) -> ca.Function:
             )
             raise InputError(f"The algebraic equations 'alg' {why}.")
         solved = -ca.solve(slopes, ca.substitute(alg, z, ca.DM.zeros(z.shape)))
-        found, wdef = ca.substitute(found, [z], [solved]), ca.substitute(wdef, z, solved)
+        result, wdef = ca.substitute(result, [z], [solved]), ca.substitute(wdef, z, solved)
     columns = [*SYMBOLS[:-1]], [*EXPRESSIONS[:-1]]
-    return ca.Function("ode", [*known, w], [*found, wdef], *columns)
+    return ca.Function("ode", [*known, w], [*result, wdef], *columns)
 
 
 def _declared(
     f: ca.Function,
     names: Mapping[str, list[str]],
-    given: Mapping[str, Sequence[Any] | None],
+    inputs: Mapping[str, Sequence[Any] | None],
     values: Mapping[str, float],
     name: str,
 ) -> dict[str, list[Any]]:
@@ -293,11 +293,11 @@ def _declared(
         problems.add(
             f"'{name}' cannot name a model; use letters, digits, underscores, no digit first."
         )
-    found: dict[str, list[Any]] = {}
+    table: dict[str, list[Any]] = {}
     for column, (kind, what) in _KINDS.items():
         count = f.numel_out(column) if column in EXPRESSIONS else f.numel_in(column)
         numbered = [column if count == 1 else f"{column}_{i}" for i in range(count)]
-        wanted = given[column]
+        wanted = inputs[column]
         rows = [wanted] if isinstance(wanted, str) else wanted
         rows = (names.get(column) or numbered) if rows is None else rows
         if len(rows) != count:
@@ -307,22 +307,22 @@ def _declared(
             )
             rows = []
         every = [_variable(kind, what, entry, values, problems) for entry in rows]
-        found[column] = [v for v in every if v is not None]
-    known = {p.name: p.value for p in found["p"]}
+        table[column] = [v for v in every if v is not None]
+    known = {p.name: p.value for p in table["p"]}
     for unknown in (k for k in values if k not in known and len(known) == f.numel_in("p")):
         problems.add(f"`values` has '{unknown}', which is no parameter; there are {[*known]}.")
-    for variable in [v for rows in found.values() for v in rows]:
+    for variable in [v for rows in table.values() for v in rows]:
         check_variable(variable, {**known, **values}, problems)
     if f.numel_out("y") == 0:
-        found["y"] = [
+        table["y"] = [
             Output(f"{s.name}_out", s.unit, s.description, s.nominal, s.display_unit)
-            for s in found["x"]
+            for s in table["x"]
         ]
-    every_name = [v.name for rows in found.values() for v in rows]
+    every_name = [v.name for rows in table.values() for v in rows]
     for twice in sorted({n for n in every_name if every_name.count(n) > 1}):
         problems.add(f"Two variables are named '{twice}'; rename one.")  # as in FMI and Modelica
     problems.raise_if_any()
-    return found
+    return table
 
 
 def _variable(

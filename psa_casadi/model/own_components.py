@@ -116,26 +116,26 @@ def written(component: Component, values: Values) -> OwnComponent:
     except InputError as error:
         raise InputError([f"'{component.name}': {p}" for p in error.problems]) from error
     variables: dict[str, Any] = {
-        kind: tuple(_declared(own, v, values) for v in getattr(component, kind))
-        for kind, (_, own) in _KINDS.items()
+        kind: tuple(_declared(item, v, values) for v in getattr(component, kind))
+        for kind, (_, item) in _KINDS.items()
     }
     return OwnComponent(**same, **variables, ports=ports, equations=equations)
 
 
 def _declared(kind: type[T], variable: Any, values: Values) -> T:
     """Return a variable as a file declares it."""
-    found: dict[str, Any] = {f.name: getattr(variable, f.name) for f in fields(kind)}  # type: ignore[arg-type]
+    table: dict[str, Any] = {f.name: getattr(variable, f.name) for f in fields(kind)}  # type: ignore[arg-type]
     for name in ("nominal", "scale", "whole"):
-        if found.get(name) is not None:
-            found[name] = nominal_value(found[name], values)
-    if "bounds" in found:
-        found["bounds"] = tuple(b if math.isfinite(b) else None for b in found["bounds"])
-    return kind(**found)
+        if table.get(name) is not None:
+            table[name] = nominal_value(table[name], values)
+    if "bounds" in table:
+        table["bounds"] = tuple(b if math.isfinite(b) else None for b in table["bounds"])
+    return kind(**table)
 
 
-def refuse_large(own: Iterable[OwnComponent]) -> None:
+def refuse_large(item: Iterable[OwnComponent]) -> None:
     """Raise InputError where components have more together than is read from a file."""
-    every = list(own)
+    every = list(item)
     texts = [text for c in every for text in c.equations.every.values()]
     variables = sum(len(getattr(c, k)) for c in every for k in (*_KINDS, "balances", "ports"))
     counts = zip(_MOST.items(), (variables, len(texts), sum(map(len, texts))), strict=True)
@@ -147,21 +147,21 @@ def refuse_large(own: Iterable[OwnComponent]) -> None:
             )
 
 
-def components_of(own: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
+def components_of(item: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
     """Return the components that a file declares, by name.
 
     Raises InputError with a sentence for each mistake, which begins with its place in the file.
     """
-    refuse_large(own.values())
-    problems, found = Problems(), {}
-    for name, declared in own.items():
+    refuse_large(item.values())
+    problems, components = Problems(), {}
+    for name, declared in item.items():
         try:
-            found[name] = _component(name, declared, opener)
+            components[name] = _component(name, declared, opener)
         except InputError as error:
             for problem in error.problems:
                 problems.add(problem)
     problems.raise_if_any()
-    return found
+    return components
 
 
 def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
@@ -184,12 +184,12 @@ def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
         raise InputError([f"'{place}': {p}" for p in problems.sentences()])
     same: dict[str, Any] = {n: getattr(declared, n) for n in _SAME}
     if declared.fmu is not None:
-        found = opener(declared.fmu, name, variables["parameters"])
+        component = opener(declared.fmu, name, variables["parameters"])
     else:
         equations = equations_of(declared.equations, f"{place}.equations")
-        found = Component(name=name, equations=equations, **same, **variables)
-        check_declarations(found, equations(OnDemand()))
-    opened = ported(found, frozenset(declared.ports))
+        component = Component(name=name, equations=equations, **same, **variables)
+        check_declarations(component, equations(OnDemand()))
+    opened = ported(component, frozenset(declared.ports))
     kept = opened.equations.ports if isinstance(opened.equations, Opened) else ()
     for port in set(declared.ports) - set(kept):
         raise InputError(f"'{place}.ports' has {port.words}, which it does not have; leave it out.")
@@ -197,8 +197,8 @@ def _component(name: str, declared: OwnComponent, opener: Opener) -> Component:
 
 
 def _variable(kind: type[T], declared: Any) -> T:
-    found = {f.name: getattr(declared, f.name) for f in fields(declared)}
-    if "bounds" in found:
-        low, high = found["bounds"]
-        found["bounds"] = (-math.inf if low is None else low, math.inf if high is None else high)
-    return kind(**found)
+    table = {f.name: getattr(declared, f.name) for f in fields(declared)}
+    if "bounds" in table:
+        low, high = table["bounds"]
+        table["bounds"] = (-math.inf if low is None else low, math.inf if high is None else high)
+    return kind(**table)

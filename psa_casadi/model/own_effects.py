@@ -50,10 +50,10 @@ def declared_effects(module: str) -> Mapping[str, Component]:
     return _effects_of(_imported(module, here=True))
 
 
-def _beside_base(found: Mapping[str, Component]) -> Mapping[str, Component]:
-    if unfit := misfits(found.values()):
+def _beside_base(components: Mapping[str, Component]) -> Mapping[str, Component]:
+    if unfit := misfits(components.values()):
         raise InputError(unfit)
-    return found
+    return components
 
 
 def misfits(effects: Iterable[Component]) -> list[str]:
@@ -73,19 +73,19 @@ def _effects_of(source: ModuleType) -> Mapping[str, Component]:
     listed = getattr(source, "EFFECTS", None)
     values = listed.values() if isinstance(listed, Mapping) else listed
     every = vars(source).values() if values is None else values
-    found = dict.fromkeys(c for c in every if isinstance(c, Component) and c.gain is not None)
-    if not found:
+    result = dict.fromkeys(c for c in every if isinstance(c, Component) and c.gain is not None)
+    if not result:
         path = getattr(source, "__file__", None)
         raise InputError(
             f"The module '{module}'{f' ({path})' if path else ''} holds no effect: a variable that"
             " is a `Component` with a gain, or a mapping EFFECTS of them."
         )
     problems, series = Problems(), {c.name: c for c in MODAL_SERIES.values()}
-    for component in found:
+    for component in result:
         if component.name in {**COMPONENTS, **EFFECTS, **series}:
             problems.add(f"{module}: an effect of this package is named '{component.name}' too.")
     problems.raise_if_any()
-    return {c.name: replace(c, home=module) for c in found}
+    return {c.name: replace(c, home=module) for c in result}
 
 
 @cache
@@ -93,13 +93,13 @@ def installed_effects() -> Mapping[str, Component]:
     """Return the effects of installed packages that have the entry point; raises InputError."""
     with _installed_only():
         modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
-    found = (_beside_base(_effects_of(_imported(module))) for module in modules)
-    return {name: c for effects in found for name, c in effects.items()}
+    result = (_beside_base(_effects_of(_imported(module))) for module in modules)
+    return {name: c for effects in result for name, c in effects.items()}
 
 
-def known_effects(own: Iterable[Component] = ()) -> dict[str, Component]:
-    """Return the effects of this package, of installed ones, and the user's `own`, by name."""
-    return {**EFFECTS, **installed_effects(), **{c.name: c for c in own}}
+def known_effects(components: Iterable[Component] = ()) -> dict[str, Component]:
+    """Return the effects of this package, installed ones, and the user's `components`, by name."""
+    return {**EFFECTS, **installed_effects(), **{c.name: c for c in components}}
 
 
 def declaration_hash(component: Component) -> str:

@@ -93,10 +93,10 @@ def compensator_for(
     components = [COMPONENTS[n] for n in kind.components]
     components += [EFFECTS[n] for n in _OBSERVED if n in there]
     lag = 0.0 if amplifier_bandwidth == inf else 1.0 / (2.0 * pi * amplifier_bandwidth)
-    own = {p.name: stack.values[p.name] for c in components for p in c.parameters
+    table = {p.name: stack.values[p.name] for c in components for p in c.parameters
            if p.name in stack.values}  # fmt: skip
-    own["drive_gain"] = stack.values["G"] * amplifier_gain
-    own["drive_time"] = stack.values["R_s"] * stack.values["C_p"] + lag
+    table["drive_gain"] = stack.values["G"] * amplifier_gain
+    table["drive_time"] = stack.values["R_s"] * stack.values["C_p"] + lag
     note = f"Compensates the hysteresis of {stack.name}, with that model's values."
-    model = compose(components, own, name=kind.name, description=kind.description)
+    model = compose(components, table, name=kind.name, description=kind.description)
     return model.with_values({}, provenance=replace(stack.provenance, notes=(note,)))

@@ -97,8 +97,8 @@ def parameter_ports(model: Model) -> tuple[Port, ...]:
     if model.structure.foreign:
         return ()
     base = [c for c in model.components if c.gain is None]
-    own = [p for c in base for p in c.parameters if p.fitted]
-    return tuple(Port("parameter", p.name, _si(p.unit)) for p in own)
+    items = [p for c in base for p in c.parameters if p.fitted]
+    return tuple(Port("parameter", p.name, _si(p.unit)) for p in items)
 
 
 def plain(component: Component) -> Component:
@@ -121,7 +121,7 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
 
     The stretch of a spring between two bodies, say: a definition. A larger number is a stiffness.
     """
-    states, found = {q.name for q in component.states}, dict[str, Mapping[str, float]]()
+    states, table = {q.name for q in component.states}, dict[str, Mapping[str, float]]()
     for name in [w.name for w in plain(component).balances]:
         definition = ca.SX(written(component).add[name])
         symbols = ca.vertcat(ca.SX(0, 1), *ca.symvar(definition))
@@ -130,8 +130,8 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
         if names and states.issuperset(names) and slopes.is_constant():
             numbers = np.array(ca.evalf(ca.densify(slopes))).ravel()
             if np.max(np.abs(numbers)) == 1.0:
-                found[name] = dict(zip(names, numbers.tolist(), strict=True))
-    return found
+                table[name] = dict(zip(names, numbers.tolist(), strict=True))
+    return table
 
 
 def kinematics(model: Model) -> dict[str, Mapping[str, float]]:
@@ -179,15 +179,15 @@ def seen_by(model: Model, port: Port) -> tuple[str, ...]:
         for group in (written(c).add, written(c).der):
             for name, term in group.items():
                 terms.setdefault(name, []).append(term)
-    found, waiting = set[str](), [*terms[port.variable]]
+    result, waiting = set[str](), [*terms[port.variable]]
     stop = {*kept, *model.state_names}
     while waiting:
-        names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - found
-        found |= names
+        names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - result
+        result |= names
         waiting += [e for n in names - stop for e in terms.get(n, ())]
-    found |= {port.variable} if port.kind == "rate" else set()
+    result |= {port.variable} if port.kind == "rate" else set()
     order = (*model.state_names, *model.input_names, *kept)
-    return tuple(n for n in order if n in found)
+    return tuple(n for n in order if n in result)
 
 
 @in_turn
@@ -199,18 +199,18 @@ def variables_at(model: Model, port: Port) -> tuple[str, ...]:
     """
     if port.kind not in ("rate", "intermediate"):
         return (port.variable,)
-    kept, seen = kinematics(model), seen_by(model, port)
-    of = [q for n in seen for q in kept.get(n, ())]
-    found: list[str] = []
+    kept, observed = kinematics(model), seen_by(model, port)
+    of = [q for n in observed for q in kept.get(n, ())]
+    texts: list[str] = []
     rows = np.zeros((0, len(model.state_names)))
-    for n in dict.fromkeys((*(n for n in seen if n in kept), *seen, *of)):
+    for n in dict.fromkeys((*(n for n in observed if n in kept), *observed, *of)):
         parts = kept.get(n, {n: 1.0})
         row = [parts.get(q, 0.0) for q in model.state_names]
         more = np.vstack([rows, row])
         if not any(row) or np.linalg.matrix_rank(more) > len(rows):
-            found.append(n)
+            texts.append(n)
             rows = more if any(row) else rows
-    return tuple(found)
+    return tuple(texts)
 
 
 def _names(component: Component, kind: Kind) -> list[str]:
@@ -240,19 +240,19 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     if isinstance(component.equations, Opened):
         ports, component = ports | {*component.equations.ports}, component.equations.component
     sorted_ports = sorted(ports, key=lambda p: p.balance)
-    own = [p for p in sorted_ports if p.variable in _names(component, p.kind)]
-    if component.gain is not None or not own:
+    items = [p for p in sorted_ports if p.variable in _names(component, p.kind)]
+    if component.gain is not None or not items:
         return component
     acts = "what acts in the place of "
     about = {"input": acts, "rate": "", "output": "what is shown of ", "parameter": acts}
     balances = [*component.balances]
-    for p in own:
+    for p in items:
         if p.kind in _BEFORE:
             before = f"{p.words} {_BEFORE[p.kind]}"
             balances.append(Balance(true_sum(p.variable), p.unit, before))
         if p.kind != "intermediate":
             balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
-    return replace(component, equations=Opened(component, tuple(own)), balances=tuple(balances))
+    return replace(component, equations=Opened(component, tuple(items)), balances=tuple(balances))
 
 
 def unit_of(model: Model, name: str) -> str:
@@ -276,13 +276,13 @@ class Opened:
 
     def __call__(self, s: Symbols) -> Equations:
         """Return the equations in these symbols."""
-        given = [p for p in self.ports if p.kind in ("input", "parameter")]
-        replaced = {p.variable: getattr(s, p.balance) for p in given}
+        items = [p for p in self.ports if p.kind in ("input", "parameter")]
+        replaced = {p.variable: getattr(s, p.balance) for p in items}
         plain = self.component.equations(_Replaced(s, replaced))
         add: dict[str, Expression] = dict(plain.add)
         der, out = dict(plain.der), dict(plain.out)
         for p in self.ports:
-            if p in given:
+            if p in items:
                 add[p.balance] = getattr(s, p.variable)
             elif p.kind == "rate":
                 add[p.balance], der[p.variable] = der[p.variable], getattr(s, p.balance)

@@ -82,9 +82,9 @@ def _identified(
     """Return the figures that a fit found; those that the record leaves open count as assumed."""
     forces = ("k_L", "A", "beta", "gamma", "delta")
     scale = "; in proportion to the assumed k_P and k_B"
-    found = {n: _given(v, run + (scale if n in forces else "")) for n, v in values.items()}
+    table = {n: _given(v, run + (scale if n in forces else "")) for n, v in values.items()}
     left = f"{run}, which leaves it open: near where the fit started"
-    return found | {n: _assumed(v, left) for n, v in undetermined.items()}
+    return table | {n: _assumed(v, left) for n, v in undetermined.items()}
 
 
 def _beside_the_record(top: float, h_ref: float, hold_rate: float) -> dict[str, Figure]:

@@ -28,10 +28,10 @@ def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> 
     for names in (symbols, outputs):
         for name in sorted({n for n in names if names.count(n) > 1}):
             problems.add(f"Two components declare '{name}'; rename one or leave one out.")
-    own = [b.name for c in components for b in c.balances]
-    for name in sorted({n for n in own if n in BALANCES or own.count(n) > 1}):
+    items = [b.name for c in components for b in c.balances]
+    for name in sorted({n for n in items if n in BALANCES or items.count(n) > 1}):
         problems.add(f"The balance '{name}' is declared more than once; rename one.")
-    for name in sorted({*own, "time"}.intersection(symbols)):
+    for name in sorted({*items, "time"}.intersection(symbols)):
         problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
     problems.raise_if_any()
 
@@ -71,14 +71,14 @@ def check_declarations(component: Component, equations: Equations) -> None:
     derived = {"velocity"} - set(equations.out)
     outputs = {o.name for o in component.outputs} - derived
     problems = Problems()
-    for kind, declared, given in (
+    for kind, declared, inputs in (
         ("derivative of the state", {s.name for s in component.states}, set(equations.der)),
         ("equation of the output", outputs, set(equations.out)),
         ("next value of the sampled state", {s.name for s in component.sampled}, {*equations.next}),
     ):
-        for name in sorted(declared - given):
+        for name in sorted(declared - inputs):
             problems.add(f"Component '{component.name}' lacks the {kind} '{name}'; declare it.")
-        for name in sorted(given - declared):
+        for name in sorted(inputs - declared):
             problems.add(
                 f"Component '{component.name}' has the {kind} '{name}', which it does not declare;"
                 " add a term to a balance instead, or declare it."
@@ -148,8 +148,8 @@ class Structure:
     @cached_property
     def foreign(self) -> tuple[Foreign, ...]:
         """The compiled functions that the equations call: of imported FMUs."""
-        found = {c.foreign.name: c.foreign for c in self.components if c.foreign}
-        return tuple(found.values())
+        table = {c.foreign.name: c.foreign for c in self.components if c.foreign}
+        return tuple(table.values())
 
     @cached_property
     def played(self) -> Any:
@@ -244,8 +244,8 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     x = _column(table[s.name] for s in states)
     xdot = resolved(der[s.name] for s in states)
     if "displacement" in balances and "velocity" not in out:
-        shown = full[list(sums).index("displacement")]
-        out["velocity"] = ca.jtimes(shown, x, xdot) + ca.jacobian(shown, table["time"])
+        displayed = full[list(sums).index("displacement")]
+        out["velocity"] = ca.jtimes(displayed, x, xdot) + ca.jacobian(displayed, table["time"])
     return Structure(
         components=components,
         parameters=parameters,

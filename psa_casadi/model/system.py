@@ -69,9 +69,9 @@ def connect(
     plan = _plan_of(parts, wires, inputs, outputs)
     wiring = _Wiring(parts, plan)
     components = [wiring.component(part) for part in parts]
-    given = {f"{part}_{n}": v for part, model in parts.items() for n, v in model.values.items()}
-    own = {p.name: given[p.name] for c in components for p in c.parameters}
-    return compose(components, own, name=name, description=description)
+    table = {f"{part}_{n}": v for part, model in parts.items() for n, v in model.values.items()}
+    item = {p.name: table[p.name] for c in components for p in c.parameters}
+    return compose(components, item, name=name, description=description)
 
 
 @dataclass(frozen=True)
@@ -100,20 +100,20 @@ def _plan_of(
             )
     sources: dict[Port, Port] = {}
     for start, end in wires:
-        given, wanted = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
-        if given is None or wanted is None:
+        arguments, wanted = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
+        if arguments is None or wanted is None:
             continue
-        (source, shown), (target, taken) = given, wanted
+        (source, displayed), (target, taken) = arguments, wanted
         if target in sources:
             problems.add(
                 f"The input '{end}' has two sources, '{'.'.join(sources[target])}' and '{start}';"
                 " leave one out."
             )
-        one, other = parse_unit(shown.unit), parse_unit(taken.unit)
+        one, other = parse_unit(displayed.unit), parse_unit(taken.unit)
         if (one.dimension, one.ratio, one.offset) != (other.dimension, other.ratio, other.offset):
             problems.add(
-                f"The wire from '{start}' [{shown.unit}] to '{end}' [{taken.unit}] joins different"
-                " units; wire ports of one unit, or put a part between them."
+                f"The wire from '{start}' [{displayed.unit}] to '{end}' [{taken.unit}] joins"
+                " different units; wire ports of one unit, or put a part between them."
             )
         sources[target] = source
     named = (
@@ -158,26 +158,26 @@ def _port(
 def _named(
     parts: Mapping[str, Model],
     kind: str,
-    given: Mapping[str, str] | None,
+    inputs: Mapping[str, str] | None,
     sources: Mapping[Port, Port],
     problems: Problems,
 ) -> dict[Port, str]:
     """Return the names outside of the inputs or outputs that have one; one name each."""
-    if given is None:
+    if inputs is None:
         every = [(part, v.name) for part, model in parts.items() for v in _variables(model, kind)]
         return {port: "_".join(port) for port in every if port not in sources}
-    found: dict[Port, str] = {}
-    for name, text in given.items():
+    texts: dict[Port, str] = {}
+    for name, text in inputs.items():
         known = _port(parts, (text, kind), problems)
         if known is None:
             continue
         port, _ = known
-        other = ".".join(sources[port]) if port in sources else found.get(port)
+        other = ".".join(sources[port]) if port in sources else texts.get(port)
         if other is not None:
             what = "has two sources," if kind == "input" else "is named twice outside,"
             problems.add(f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out.")
-        found[port] = name
-    return found
+        texts[port] = name
+    return texts
 
 
 class _Wiring:
@@ -196,8 +196,13 @@ class _Wiring:
     def _renamed(self, name: str, model: Model) -> list[Expression]:
         """Return slopes, next values, switches and outputs of a part in its own new symbols."""
         s, new = model.structure, [self.symbols["time"]]
-        own = (*model.parameter_names, *model.state_names, *model.sampled_names, *model.input_names)
-        for n in own:
+        item = (
+            *model.parameter_names,
+            *model.state_names,
+            *model.sampled_names,
+            *model.input_names,
+        )
+        for n in item:
             symbol, port = ca.SX.sym(f"{name}_{n}"), (name, n)
             if n in model.input_names and port not in self.plan.inputs:
                 new.append(self.inside.setdefault(port, symbol))
@@ -207,10 +212,10 @@ class _Wiring:
                 outside = self.plan.period
             new.append(self.symbols.setdefault(outside, symbol))
         results = [s.xdot, s.znext, ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.y]
-        found: list[Expression] = ca.substitute(
-            results, [s.time, *(s.symbols[n] for n in own)], new
+        expressions: list[Expression] = ca.substitute(
+            results, [s.time, *(s.symbols[n] for n in item)], new
         )
-        return found
+        return expressions
 
     def component(self, name: str) -> Component:
         """Return a part as a component whose variables are named `part_variable`.
@@ -224,18 +229,22 @@ class _Wiring:
         whole = self._wired(name, ca.vertcat(*self.results[name][:3]), ())
         rows = iter([whole[k] for k in range(whole.numel())])
         values = {k: {f"{name}_{n}": next(rows) for n in names} for k, names in places.items()}
-        shown = {n: self.output((name, n), ()) for n in model.output_names}
+        table = {n: self.output((name, n), ()) for n in model.output_names}
         values["out"] = {
-            plan.outputs[q]: e for n, e in shown.items() if (q := (name, n)) in plan.outputs
+            plan.outputs[q]: e for n, e in table.items() if (q := (name, n)) in plan.outputs
         }
         before = list(self.symbols.values())
 
         def equations(symbols: Symbols) -> Equations:
             after = [getattr(symbols, n) for n in self.symbols]
-            return Equations(**{
-                kind: dict(zip(own, ca.substitute(list(own.values()), before, after), strict=True))
-                for kind, own in values.items()
-            })  # fmt: skip
+            return Equations(
+                **{
+                    kind: dict(
+                        zip(item, ca.substitute(list(item.values()), before, after), strict=True)
+                    )
+                    for kind, item in values.items()
+                }
+            )
 
         sources = "; ".join(dict.fromkeys(c.source.rstrip(".") for c in model.components))
         return Component(
@@ -291,8 +300,8 @@ class _Wiring:
             )
         if port not in self.known:
             name, variable = port
-            own = self.results[name][3][self.models[name].output_names.index(variable)]
-            self.known[port] = self._wired(name, own, (*path, port))
+            item = self.results[name][3][self.models[name].output_names.index(variable)]
+            self.known[port] = self._wired(name, item, (*path, port))
         return self.known[port]
 
     def _wired(self, name: str, expression: Expression, path: tuple[Port, ...]) -> Expression:

@@ -66,10 +66,10 @@ def _along(x: Expression, points: Any, values: Expression, kind: str) -> Express
     inside = ca.fmin(ca.fmax(x, at[0]), at[-1])
     pieces = []
     for k, begin in enumerate(at[:-1]):
-        found = 0.0
+        result = 0.0
         for row in weights[:, k]:
-            found = found * (inside - begin) + ca.dot(ca.DM(row), values)
-        pieces.append(found)
+            result = result * (inside - begin) + ca.dot(ca.DM(row), values)
+        pieces.append(result)
     total = pieces[0]
     for begin, piece in zip(at[1:-1], pieces[1:], strict=True):
         total = ca.if_else(inside >= begin, piece, total)

@@ -66,25 +66,25 @@ def estimates(findings: Sequence[Finding], name: str) -> Estimates:
     else (high - low)/3.92, as the intervals of a fit are made.
     """
     rows = [(k, f.parameters[name]) for k, f in enumerate(findings) if name in f.parameters]
-    told = [(k, p.value, *p.interval) for k, p in rows if _tells(p) and p.interval]
-    log = name in _shown()[0] and all(min(value, low) > 0.0 for _, value, low, _ in told)
-    widths = [math.log(high / low) if log else high - low for *_, low, high in told]
+    items = [(k, p.value, *p.interval) for k, p in rows if _tells(p) and p.interval]
+    log = name in _shown()[0] and all(min(value, low) > 0.0 for _, value, low, _ in items)
+    widths = [math.log(high / low) if log else high - low for *_, low, high in items]
     first = rows[0][1] if rows else Found(0.0, "", None)
     return Estimates(
         name,
         first.unit,
         first.meaning,
         log,
-        tuple(k for k, *_ in told),
-        np.array([math.log(value) if log else value for _, value, *_ in told]),
+        tuple(k for k, *_ in items),
+        np.array([math.log(value) if log else value for _, value, *_ in items]),
         np.array(widths) / (2.0 * NORMAL_95),
     )
 
 
 def names_of(findings: Sequence[Finding]) -> tuple[str, ...]:
     """Return the names of the parameters that a device tells, in the order of the first files."""
-    found = (n for f in findings for n, p in f.parameters.items() if _tells(p))
-    return tuple(dict.fromkeys(found))
+    result = (n for f in findings for n, p in f.parameters.items() if _tells(p))
+    return tuple(dict.fromkeys(result))
 
 
 def _tells(p: Found) -> bool:
@@ -185,11 +185,11 @@ def population(findings: Sequence[Finding]) -> Population:
     spreads: list[Spread] = []
     few: list[str] = []
     for name in names_of(findings):
-        found = estimates(findings, name)
-        if len(found.places) <= FEWEST:
+        result = estimates(findings, name)
+        if len(result.places) <= FEWEST:
             few.append(name)
         else:
-            spreads.append(_spread(findings, found))
+            spreads.append(_spread(findings, result))
     if not spreads:
         raise InputError(
             f"No parameter is told by more than {FEWEST} of the {len(findings)} devices, so there"
@@ -211,11 +211,11 @@ def population(findings: Sequence[Finding]) -> Population:
     )
 
 
-def _spread(findings: Sequence[Finding], found: Estimates) -> Spread:
-    far = outliers(found.theta, found.errors)
+def _spread(findings: Sequence[Finding], result: Estimates) -> Spread:
+    far = outliers(result.theta, result.errors)
     kept = ~far.found
-    theta, errors = found.theta[kept], found.errors[kept]
-    those = [findings[k] for k, keep in zip(found.places, kept, strict=True) if keep]
+    theta, errors = result.theta[kept], result.errors[kept]
+    those = [findings[k] for k, keep in zip(result.places, kept, strict=True) if keep]
     batches = [f.batch for f in those]
     tested = None
     if all(batches) and 1 < len(set(batches)) < len(batches) - 1:
@@ -224,7 +224,7 @@ def _spread(findings: Sequence[Finding], found: Estimates) -> Spread:
     moved = None
     if len(days) == len(those) and len(days) > FEWEST and np.ptp(days) > 0.0:
         moved = drift(theta, errors, days)
-    return Spread(found, mixed_regression(theta, errors), far, tested, moved)
+    return Spread(result, mixed_regression(theta, errors), far, tested, moved)
 
 
 def _outliers(findings: Sequence[Finding], spreads: Sequence[Spread]) -> tuple[Outlier, ...]:
@@ -235,12 +235,12 @@ def _outliers(findings: Sequence[Finding], spreads: Sequence[Spread]) -> tuple[O
         for k, z, p in zip(s.estimates.places, s.far.z, s.far.p, strict=True)
     ]
     corrected = adjusted([p for *_, p in tests])
-    found = [
+    items = [
         Outlier(device, name, z, float(c))
         for (device, name, z, _), c in zip(tests, corrected, strict=True)
         if c < LIMIT
     ]
-    return tuple(sorted(found, key=lambda o: -abs(o.z)))
+    return tuple(sorted(items, key=lambda o: -abs(o.z)))
 
 
 def _over_parameters(p_values: dict[str, float]) -> dict[str, float]:
@@ -249,11 +249,11 @@ def _over_parameters(p_values: dict[str, float]) -> dict[str, float]:
 
 def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency, ...]:
     """Count words, the most frequent first; intervals of the share are Wilson's."""
-    total, found = len(words) if of is None else of, []
+    total, result = len(words) if of is None else of, []
     for word, count in Counter(words).most_common():
         share = scipy.stats.binomtest(count, total).proportion_ci(method="wilson")
-        found.append(Frequency(word, count, total, (float(share.low), float(share.high))))
-    return tuple(found)
+        result.append(Frequency(word, count, total, (float(share.low), float(share.high))))
+    return tuple(result)
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,9 +77,9 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
         return np.asarray(scipy.stats.false_discovery_control(values), dtype=float)
     order = np.argsort(values)
     steps = np.maximum.accumulate(values[order] * np.arange(values.size, 0, -1))
-    found = np.empty_like(values)
-    found[order] = np.minimum(1.0, steps)
-    return found
+    result = np.empty_like(values)
+    result[order] = np.minimum(1.0, steps)
+    return result
 
 
 #: What intervals are meant to hold.
@@ -221,14 +221,14 @@ def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     y, s = np.asarray(theta, dtype=float), np.asarray(errors, dtype=float)
     if y.size <= FEWEST:
         raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
-    found = np.zeros(y.size, dtype=np.bool_)
-    z, p, corrected = _tested(y, s, found)
+    result = np.zeros(y.size, dtype=np.bool_)
+    z, p, corrected = _tested(y, s, result)
     for _ in range(_ROUNDS):
-        more = found | (corrected < LIMIT)
-        if (more == found).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
+        more = result | (corrected < LIMIT)
+        if (more == result).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
             break
-        found = more
-        z, p, corrected = _tested(y, s, found)
+        result = more
+        z, p, corrected = _tested(y, s, result)
     return Outliers(z, p, corrected, corrected < LIMIT)
 
 
@@ -255,7 +255,7 @@ def _left_out(y: FloatArray, s: FloatArray) -> FloatArray:
     n, dof = y.size, y.size - 2
     unit = float(np.median(s))
     y, variance = (y - np.median(y)) / unit, (s / unit) ** 2
-    block, found = max(1, _AT_ONCE // n), []
+    block, result = max(1, _AT_ONCE // n), []
     for first in range(0, n, block):
         left_out = np.arange(first, min(first + block, n))
         others = np.ones((left_out.size, n))
@@ -272,8 +272,8 @@ def _left_out(y: FloatArray, s: FloatArray) -> FloatArray:
                 break
             tau2 += step
         spread = variance[left_out] + tau2 + np.maximum(1.0, q / dof) / total
-        found.append((y[left_out] - mean) / np.sqrt(spread))
-    return np.concatenate(found)
+        result.append((y[left_out] - mean) / np.sqrt(spread))
+    return np.concatenate(result)
 
 
 @dataclass(frozen=True)

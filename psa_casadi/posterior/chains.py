@@ -56,12 +56,12 @@ def prior_draws(task: Task, count: int, rng: np.random.Generator) -> FloatArray:
     Offsets have flat priors and stay 0.
     """
     known = np.isfinite(task.unknowns.prior)
-    width, found = task.unknowns.prior[known], np.zeros((count, task.unknowns.size))
+    width, values = task.unknowns.prior[known], np.zeros((count, task.unknowns.size))
     low, high = (edge[known] / width for edge in task.unknowns.bounds())
-    found[:, known] = width * scipy.stats.truncnorm.rvs(
+    values[:, known] = width * scipy.stats.truncnorm.rvs(
         low, high, size=(count, int(known.sum())), random_state=rng
     )
-    return found
+    return values
 
 
 def predictive(
@@ -74,7 +74,7 @@ def predictive(
     offset that was projected out. With `fit_offset`, for draws of the prior, whose offsets are
     flat, a sensor's offset is the one that fits best, and the level is that of the fit.
     """
-    kept, shown, noise, blocks = [], [], [], task.density.blocks
+    kept, displayed, noise, blocks = [], [], [], task.density.blocks
     for theta in draws:
         try:
             parts = predict(
@@ -100,18 +100,18 @@ def predictive(
             levels.append(level)
         kept.append(theta)
         noise.append(levels)
-        shown.append(
+        displayed.append(
             [y + s * rng.standard_normal(len(y)) for y, s in zip(clean, levels, strict=True)]
         )
     return Predictive(
         theta=np.array(kept).reshape(len(kept), draws.shape[1]),
         readings=tuple(
-            np.array([own[k] for own in shown]).reshape(
+            np.array([item[k] for item in displayed]).reshape(
                 len(kept), task.experiments[b.record].record.n
             )
             for k, b in enumerate(blocks)
         ),
-        noise=tuple(np.array([own[k] for own in noise]) for k, _ in enumerate(blocks)),
+        noise=tuple(np.array([item[k] for item in noise]) for k, _ in enumerate(blocks)),
         failed=len(draws) - len(kept),
     )
 
@@ -178,11 +178,11 @@ def chains_of(
     size, context = density.size, copy_context()
 
     def make() -> Callable[..., Any]:  # a density for each chain's thread, in the caller's context
-        own = context.copy()
+        paths = context.copy()
 
         def value(u: npt.ArrayLike) -> tuple[float, FloatArray]:
             try:
-                return own.run(density, np.asarray(u))
+                return paths.run(density, np.asarray(u))
             except KeyboardInterrupt:  # in the sampler's thread; the caller's raises it
                 return -np.inf, np.zeros(size)
 
@@ -195,8 +195,8 @@ def chains_of(
         expanded_dtypes=[np.dtype("float64")],
         expanded_shapes=[(size,)],
         expanded_names=["u"],
-        make_initial_point_fn=lambda own: (
-            _SPREAD * np.random.default_rng(own).standard_normal(size)
+        make_initial_point_fn=lambda paths: (
+            _SPREAD * np.random.default_rng(paths).standard_normal(size)
         ),
     )
     running = nutpie.sample(
@@ -204,11 +204,11 @@ def chains_of(
         target_accept=_ACCEPT, progress_bar=False, save_warmup=False, blocking=False,
     )  # fmt: skip
     progress("sampling")
-    found = None
+    table = None
     try:
-        while found is None:
+        while table is None:
             with suppress(TimeoutError):
-                found = running.wait(timeout=_LOOK)
+                table = running.wait(timeout=_LOOK)
             raise_if_stopped()
     except BaseException as error:  # a chain may end at the interrupt before this thread knows
         if isinstance(error, KeyboardInterrupt):
@@ -218,11 +218,11 @@ def chains_of(
         raise_if_stopped()
         raise
     statistics = {
-        ours: found.sample_stats[theirs].to_numpy()
+        ours: table.sample_stats[theirs].to_numpy()
         for theirs, ours in _STATISTICS.items()
-        if theirs in found.sample_stats
+        if theirs in table.sample_stats
     }
-    return Chains(found.posterior["u"].to_numpy(), statistics)
+    return Chains(table.posterior["u"].to_numpy(), statistics)
 
 
 _RECORD = "record"
@@ -245,32 +245,32 @@ def data_tree(
     """Return an `arviz.InferenceData` of all groups; `theta` is (chains, draws, size)."""
     _, arviz = sampler_and_arviz()
     draws, before = quantities(task, theta), quantities(task, prior.theta[None])
-    seen, applied, times = _recorded(task)
-    told, blocks = _units(task), task.density.blocks
-    dims = {n: [_RECORD] for n in told if n not in task.unknowns.names}
-    for name, (time, _, unit, meaning) in (seen | applied).items():
-        dims[name], told[name], told[time] = [time], (unit, meaning), ("s", "Time")
+    observed, applied, times = _recorded(task)
+    output, blocks = _units(task), task.density.blocks
+    dims = {n: [_RECORD] for n in output if n not in task.unknowns.names}
+    for name, (time, _, unit, meaning) in (observed | applied).items():
+        dims[name], output[name], output[time] = [time], (unit, meaning), ("s", "Time")
     predictions = []
     for p in (posterior, prior):
-        shown = {column_of(task, b): y[None] for b, y in zip(blocks, p.readings, strict=True)}
+        table = {column_of(task, b): y[None] for b, y in zip(blocks, p.readings, strict=True)}
         for b, level in zip(blocks, p.noise, strict=True):
             name, count = _of("noise", task.channel(b)), len(task.experiments)
-            shown.setdefault(name, np.full((1, len(level), count), np.nan))[0, :, b.record] = level
-        predictions.append(shown)
+            table.setdefault(name, np.full((1, len(level), count), np.nan))[0, :, b.record] = level
+        predictions.append(table)
     tree = arviz.from_dict(
         posterior=draws,
         sample_stats=chains.statistics,
         prior=before,
         posterior_predictive=predictions[0],
         prior_predictive=predictions[1],
-        observed_data={n: values for n, (_, values, *_) in seen.items()},
+        observed_data={n: values for n, (_, values, *_) in observed.items()},
         constant_data={n: values for n, (_, values, *_) in applied.items()},
         coords={_RECORD: [e.record.name for e in task.experiments], **times},
         dims=dims,
     )
     for group in tree.groups():
         for name in tree[group].variables:
-            unit, meaning = told.get(name, ("", ""))
+            unit, meaning = output.get(name, ("", ""))
             if unit:
                 tree[group][name].attrs |= {"units": unit, "long_name": meaning}
     tree.posterior.attrs["inference_library"] = "nutpie"
@@ -284,21 +284,21 @@ _Columns = dict[str, tuple[str, FloatArray, str, str]]
 
 def _recorded(task: Task) -> tuple[_Columns, _Columns, dict[str, FloatArray]]:
     """Return what was measured and what was applied, by names in the tree, and the times."""
-    seen: _Columns = {}
+    columns: _Columns = {}
     applied: _Columns = {}
     times = {}
     for k, e in enumerate(task.experiments):
         first = next((column_of(task, b) for b in task.of_record(k)), "")
         for b in task.of_record(k):
             times[f"time_{first}"], c = e.record.time, task.channel(b)
-            told = e.measured(b.channel), c.unit, c.column
-            seen[column_of(task, b)] = (f"time_{first}", *told)
-        for given in task.model.structure.inputs:
-            values = e.record.column(given.name)
+            output = e.measured(b.channel), c.unit, c.column
+            columns[column_of(task, b)] = (f"time_{first}", *output)
+        for inputs in task.model.structure.inputs:
+            values = e.record.column(inputs.name)
             if first and values is not None:
-                told = values, given.unit, given.description
-                applied[f"{given.name}_{first}"] = (f"time_{first}", *told)
-    return seen, applied, times
+                output = values, inputs.unit, inputs.description
+                applied[f"{inputs.name}_{first}"] = (f"time_{first}", *output)
+    return columns, applied, times
 
 
 def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
@@ -306,16 +306,16 @@ def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
     u, shape = task.unknowns, theta.shape[:2]
     flat = theta.reshape(-1, theta.shape[2])
     rows = [u.values(t) for t in flat]
-    found = {n: np.array([r[n] for r in rows]).reshape(shape) for n in u.names}
+    table = {n: np.array([r[n] for r in rows]).reshape(shape) for n in u.names}
     starts = [[u.start(t, k) for k in range(u.records)] for t in flat]
     for name in _states(u):
-        own = [[s.get(name, np.nan) for s in each] for each in starts]
-        found[f"start_{name}"] = np.array(own).reshape(*shape, u.records)
+        items = [[s.get(name, np.nan) for s in each] for each in starts]
+        table[f"start_{name}"] = np.array(items).reshape(*shape, u.records)
     first = task.experiments[0].channels[0]
     if first.offset:
         offsets = [[u.offset(t, k) for k in range(u.records)] for t in flat]
-        found[_of("offset", first)] = np.array(offsets).reshape(*shape, u.records)
-    return found
+        table[_of("offset", first)] = np.array(offsets).reshape(*shape, u.records)
+    return table
 
 
 def _states(u: Unknowns) -> tuple[str, ...]:
@@ -325,16 +325,16 @@ def _states(u: Unknowns) -> tuple[str, ...]:
 def _units(task: Task) -> dict[str, tuple[str, str]]:
     """Return unit and meaning of every variable."""
     u, model = task.unknowns, task.model
-    told = {n: (model.parameter(n).unit, model.parameter(n).description) for n in u.names}
+    table = {n: (model.parameter(n).unit, model.parameter(n).description) for n in u.names}
     states = {s.name: s for s in model.structure.states}
     for name in _states(u):
         meaning = f"Start of a record: {states[name].description}, as a deviation from rest"
-        told[f"start_{name}"] = (states[name].unit, meaning)
+        table[f"start_{name}"] = (states[name].unit, meaning)
     for k, channel in enumerate(task.experiments[0].channels):
         sensor = channel.column if channel.column != "displacement" else "displacement sensor"
         if k == 0 and channel.offset:
-            told[_of("offset", channel)] = (channel.unit, f"Offset of the {sensor} in a record")
+            table[_of("offset", channel)] = (channel.unit, f"Offset of the {sensor} in a record")
         if not channel.factors:
             meaning = "Standard deviation of the noise of a record"
-            told[_of("noise", channel)] = (channel.unit, meaning)
-    return told
+            table[_of("noise", channel)] = (channel.unit, meaning)
+    return table

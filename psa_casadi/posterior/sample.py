@@ -117,7 +117,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
         tree, var_names=list(task.unknowns.names), hdi_prob=HDI, round_to="none", kind="all"
     )
     edge, u = 50.0 * (1.0 - HDI), task.unknowns
-    found = []
+    items = []
     for k, name in enumerate(u.names):
         row, values = table.loc[name], tree.posterior[name].to_numpy()
         if u.loop is not None and k in u.loop:
@@ -126,7 +126,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
         else:  # in ln units where these are searched
             moved = np.log(values) if u.log[k] else values / u.scale[k]
             share = float(np.std(moved) / u.prior[k])
-        found.append(
+        items.append(
             Figures(
                 name=name,
                 unit=task.model.parameter(name).unit,
@@ -140,7 +140,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
                 prior_share=share,
             )
         )
-    return tuple(found)
+    return tuple(items)
 
 
 def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple[Note, ...]:
@@ -235,29 +235,29 @@ def sample(
         task = own_task_of(model, records, free=free, prior=prior, widths=widths, **words)
     rng = np.random.default_rng(seed)
     with one_thread():
-        found = chains_of(
+        result = chains_of(
             task.density, chains=chains, draws=draws, tune=tune, seed=seed, cores=cores,
             progress=progress,
         )  # fmt: skip
-        theta = np.apply_along_axis(task.density.theta, 2, found.u)
+        theta = np.apply_along_axis(task.density.theta, 2, result.u)
         progress("predicting")
         before = predictive(task, prior_draws(task, _PREDICTED, rng), rng, fit_offset=True)
         flat = theta.reshape(-1, theta.shape[2])
         some = rng.choice(len(flat), min(_PREDICTED, len(flat)), replace=False)
         after = predictive(task, flat[some], rng, fit_offset=False)
-    tree = data_tree(task, found, theta, before, after)
+    tree = data_tree(task, result, theta, before, after)
     figures = figures_of(task, tree)
     failed = [note("prior_fails", count=before.failed, draws=_PREDICTED)] if before.failed else []
     return Posterior(
         model=task.model.with_values(task.unknowns.values(task.theta)),
         tree=tree,
         figures=figures,
-        divergences=found.divergences,
+        divergences=result.divergences,
         chains=chains,
         draws=draws,
         seed=seed,
         task=task,
-        doubts=doubts_of(task, found, figures),
+        doubts=doubts_of(task, result, figures),
         notes=(*task.sentences, *failed),
     )
 

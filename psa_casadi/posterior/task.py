@@ -126,14 +126,14 @@ class Density:
         z = self.centre + self.factor @ u
         theta, slope, bend = self.within.theta(z)
         with np.errstate(all="ignore"):
-            found = self.evaluate(theta) if np.isfinite(theta).all() else None
-            if found is None:
+            result = self.evaluate(theta) if np.isfinite(theta).all() else None
+            if result is None:
                 return -np.inf, np.zeros_like(u)
-            residual, jacobian = found
+            residual, jacobian = result
             value, pull, rest = 0.0, residual.copy(), residual.copy()
             for block in self.blocks:
-                own = residual[block.rows]
-                power = float(own @ own)
+                item = residual[block.rows]
+                power = float(item @ item)
                 value -= 0.5 * block.count * float(np.log(power))
                 pull[block.rows] *= block.count / power
                 rest[block.rows] = 0.0
@@ -193,7 +193,7 @@ def task_of(
     and `widths` their standard deviations, in ln units for parameters that span decades, else in
     ordinary changes. Raises InputError, SimulationError.
     """
-    parts, said = without_gaps(list(records))
+    parts, statement = without_gaps(list(records))
     ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]
     columns = columns_of(model.with_declared_starts(), fitted)
@@ -204,7 +204,7 @@ def task_of(
     return _around(
         centre, experiments, {n: columns.model.values[n] for n in names}, widths or {},
         noise_levels(experiments), None,
-        (*said, *(s for _, own in ready for s in own), *columns.left_out),
+        (*statement, *(s for _, item in ready for s in item), *columns.left_out),
     )  # fmt: skip
 
 
@@ -224,15 +224,20 @@ def own_task_of(
     """
     names = free_of(model, free or model.provenance.free or None)
     _refuse(model, names, {**(prior or {}), **(widths or {})})
-    found = identify_ode(model, records, free=names, **words)
-    if found.fit.interrupted:
+    identification = identify_ode(model, records, free=names, **words)
+    if identification.fit.interrupted:
         raise KeyboardInterrupt
-    told = found.fit.model
-    declared = {n: told.parameter(n).value for n in names}
+    output = identification.fit.model
+    declared = {n: output.parameter(n).value for n in names}
     return _around(
-        told.with_values({**declared, **(prior or {})}), weighted(found.fit, found.experiments),
-        {n: told.values[n] for n in names}, widths or {}, found.fit.sigma, found.fit, found.doubts,
-    )  # fmt: skip
+        output.with_values({**declared, **(prior or {})}),
+        weighted(identification.fit, identification.experiments),
+        {n: output.values[n] for n in names},
+        widths or {},
+        identification.fit.sigma,
+        identification.fit,
+        identification.doubts,
+    )
 
 
 def _around(
@@ -241,12 +246,12 @@ def _around(
     values: Mapping[str, float],
     widths: Mapping[str, float],
     sigma: Sequence[float],
-    begun: Fit | None,
+    fit: Fit | None,
     sentences: tuple[Note | str, ...],
 ) -> Task:
     """Fit from the values, with priors about those of `centre`, and set up the density there.
 
-    Every record begins as in the fit `begun`, if there is one.
+    Every record begins as in the fit `fit`, if there is one.
     """
     names = tuple(values)
     unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
@@ -257,29 +262,29 @@ def _around(
     theta = np.zeros(unknowns.size)
     theta[: len(names)] = unknowns.coordinates(values)
     for r in range(unknowns.records):
-        start, offset = (begun.start(r), begun.offset(r)) if begun else ({}, 0.0)
+        start, offset = (fit.start(r), fit.offset(r)) if fit else ({}, 0.0)
         unknowns.place(theta, r, start, offset)
     for _ in range(_ROUNDS):  # levels of records and of columns that the residuals suggest
-        found, way, _ = accurate_minimum(
+        result, way, _ = accurate_minimum(
             centre, experiments, unknowns, theta, sigma,
             tolerance=_TOLERANCE, evaluations=_EVALUATIONS,
         )  # fmt: skip
-        if found.interrupted:
+        if result.interrupted:
             raise KeyboardInterrupt
-        theta, weights = found.theta, weights_of(experiments, sigma)
+        theta, weights = result.theta, weights_of(experiments, sigma)
         ends = np.cumsum([e.at(0).sum() for e in experiments])
-        own = np.split(found.residual[: len(weights)] * weights, ends[:-1])
+        item = np.split(result.residual[: len(weights)] * weights, ends[:-1])
         sigma = [
             max(float(np.sqrt(np.mean(r**2))), 1e-15) if r.size else s
-            for r, s in zip(own, sigma, strict=True)
+            for r, s in zip(item, sigma, strict=True)
         ]
-        shown = predict(centre, experiments, unknowns, theta, way=way, further=True)
-        levels = [f.relevelled() for f in further_of(experiments, shown)]
+        displayed = predict(centre, experiments, unknowns, theta, way=way, further=True)
+        levels = [f.relevelled() for f in further_of(experiments, displayed)]
         experiments = tuple(e.beside(levels) for e in experiments)
-    return _task(centre, tuple(experiments), unknowns, found, way, sigma, sentences)
+    return _task(centre, tuple(experiments), unknowns, result, way, sigma, sentences)
 
 
-def _refuse(model: Model, names: Sequence[str], given: Mapping[str, float]) -> None:
+def _refuse(model: Model, names: Sequence[str], values: Mapping[str, float]) -> None:
     problems = Problems()
     for name in names:
         if name not in model.values:
@@ -287,7 +292,7 @@ def _refuse(model: Model, names: Sequence[str], given: Mapping[str, float]) -> N
                 f"'{name}' is no parameter of the model '{model.name}'; it has"
                 f" {', '.join(model.parameter_names)}."
             )
-    for name in given:
+    for name in values:
         if name not in names:
             problems.add(
                 f"A prior of '{name}' was given, which is not sampled; sampled are"
@@ -297,7 +302,7 @@ def _refuse(model: Model, names: Sequence[str], given: Mapping[str, float]) -> N
 
 
 def _centres(
-    model: Model, records: Sequence[Record], names: Sequence[str], given: Mapping[str, float]
+    model: Model, records: Sequence[Record], names: Sequence[str], values: Mapping[str, float]
 ) -> dict[str, float]:
     """Return where the priors are centred: as given, else a stack of the records' size.
 
@@ -311,21 +316,21 @@ def _centres(
     centre = {n: ordinary.get(n, declared[n]) for n in names}
     if "A" in centre and centre["A"] * model.values["A"] <= 0.0:
         centre |= {n: model.values[n] for n in ("k_L", "A", "beta", "gamma") if n in centre}
-    return {**centre, **given}
+    return {**centre, **values}
 
 
 def _task(
     model: Model,
     experiments: tuple[Experiment, ...],
     unknowns: Unknowns,
-    found: Minimum,
+    minimum: Minimum,
     way: Way,
     sigma: Sequence[float],
     sentences: tuple[Note | str, ...],
 ) -> Task:
     evaluate = Objective(model, experiments, unknowns, sigma, way)
     low, high = unknowns.bounds()
-    again = evaluate(found.theta)
+    again = evaluate(minimum.theta)
     if again is None:
         raise InputError("The model cannot be simulated at its fit; start from another model.")
     residual, jacobian = again
@@ -333,19 +338,19 @@ def _task(
     for j, channel in enumerate(experiments[0].channels):
         for r, e in enumerate(experiments):
             first, last = last, last + int(e.at(j).sum())
-            rows, own = slice(first, last), residual[first:last]
-            if not own.size:
+            rows, item = slice(first, last), residual[first:last]
+            if not item.size:
                 continue
-            alike, projected = 1.0, float(j > 0 and channel.offset)
+            similar, projected = 1.0, float(j > 0 and channel.offset)
             if not channel.factors:
-                lags = autocovariance(own)  # how many neighbouring samples count as one
+                lags = autocovariance(item)  # how many neighbouring samples count as one
                 ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
-                alike = max(1.0, ratio)
+                similar = max(1.0, ratio)
                 level = (channel.level if j else sigma[r]) * e.share(j)
-                level *= float(np.sqrt(np.mean(own**2)))
-                count = (len(own) - projected) / alike
-                blocks.append(Block(rows, count, r, j, alike, level))
-            precision += jacobian[rows].T @ jacobian[rows] / alike
+                level *= float(np.sqrt(np.mean(item**2)))
+                count = (len(item) - projected) / similar
+                blocks.append(Block(rows, count, r, j, similar, level))
+            precision += jacobian[rows].T @ jacobian[rows] / similar
     rest = jacobian[last:]
     precision += rest.T @ rest
     within = Within(low, high)
@@ -353,16 +358,16 @@ def _task(
     moving = np.ones(unknowns.size, dtype=bool)
     if not unknowns.offset_scale:  # without an unknown zero, offsets stay at 0
         moving[list(unknowns.offsets)] = False
-    centre, factor = _whitening(within, found.theta, precision, covariance, moving)
+    centre, factor = _whitening(within, minimum.theta, precision, covariance, moving)
     return Task(
         model=model,
         experiments=experiments,
         unknowns=unknowns,
         density=Density(evaluate, tuple(blocks), within, centre, factor),
-        theta=found.theta,
+        theta=minimum.theta,
         covariance=covariance,
         way=way,
-        converged=found.converged,
+        converged=minimum.converged,
         sentences=sentences,
     )
 
@@ -386,8 +391,8 @@ def _whitening(
     _, slope, bend = within.theta(z)
     curvature = precision * np.outer(slope, slope)
     both = np.isfinite(within.low) & np.isfinite(within.high)
-    own = np.where(both, 0.5 * (1.0 - bend**2), 0.0)
-    curvature += np.diag(own + np.where(inside != theta, _TAIL, 0.0))
+    text = np.where(both, 0.5 * (1.0 - bend**2), 0.0)
+    curvature += np.diag(text + np.where(inside != theta, _TAIL, 0.0))
     sizes, directions = np.linalg.eigh(curvature[np.ix_(moving, moving)])
     sizes = np.maximum(sizes, 1e-12 * sizes[-1])
     factor = np.zeros((len(z), len(sizes)))

@@ -110,21 +110,21 @@ def _followed(
 ) -> bool:
     """Whether straight lines between the means meet the signal, but for its white noise."""
     error = signal - _lines(record.time, wider.time, means)
-    own = fast_noise(signal)
+    value = fast_noise(signal)
     smooth = np.convolve(error, np.ones(q) / q, mode="valid")
     return bool(
-        np.max(np.abs(error)) <= allowed + LARGEST * own * np.sqrt(1.0 + 1.0 / q)
-        and np.max(np.abs(smooth)) <= allowed + LARGEST * own / np.sqrt(q)
+        np.max(np.abs(error)) <= allowed + LARGEST * value * np.sqrt(1.0 + 1.0 / q)
+        and np.max(np.abs(smooth)) <= allowed + LARGEST * value / np.sqrt(q)
     )
 
 
 def _lines(time: FloatArray, centres: FloatArray, means: FloatArray) -> FloatArray:
     """Return straight lines between the means, continued before the first and after the last."""
-    found = np.interp(time, centres, means)
+    values = np.interp(time, centres, means)
     for end, inner, outside in ((0, 1, time < centres[0]), (-1, -2, time > centres[-1])):
         rate = (means[end] - means[inner]) / (centres[end] - centres[inner])
-        found[outside] = means[end] + rate * (time[outside] - centres[end])
-    return found
+        values[outside] = means[end] + rate * (time[outside] - centres[end])
+    return values
 
 
 def _straight(means: FloatArray, noise: float) -> bool:

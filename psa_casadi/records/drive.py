@@ -54,8 +54,8 @@ def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
         return True
     lines = [m * mains for mains in _MAINS for m in range(1, _MULTIPLES + 1)]
     near = any(abs(frequency - line) < _OFF * line for line in lines)
-    own = abs(frequency - round(frequency / drive) * drive) <= _APART / record.duration
-    return hum and near and not own
+    item = abs(frequency - round(frequency / drive) * drive) <= _APART / record.duration
+    return hum and near and not item
 
 
 def turns(voltage: FloatArray, share: float = 0.1) -> bool:

@@ -34,13 +34,13 @@ def columns_of(inputs: Sequence[FloatArray], predicted: FloatArray) -> FloatArra
     """
     y = _scaled(predicted)
     rate = np.gradient(y)
-    found = [y, y**2, y**3, rate, np.abs(rate), np.gradient(rate)]
+    items = [y, y**2, y**3, rate, np.abs(rate), np.gradient(rate)]
     for k, u in enumerate(inputs):
         v = _scaled(u)
-        found += [v, v**2, v**3]
+        items += [v, v**2, v**3]
         if k == 0 and np.ptp(u) > 0.0:
-            found += _history(v)
-    table = np.array([straightened(c) for c in found])
+            items += _history(v)
+    table = np.array([straightened(c) for c in items])
     size = np.linalg.norm(table, axis=1)
     kept = size > 1e-9 * float(size.max(initial=0.0))
     rows: FloatArray = table[kept] / size[kept, None]
@@ -48,8 +48,8 @@ def columns_of(inputs: Sequence[FloatArray], predicted: FloatArray) -> FloatArra
 
 
 def _spectra(rows: FloatArray) -> FloatArray:
-    found: FloatArray = scipy.fft.rfft(rows, axis=-1)[..., 1:].view(np.float64)
-    return found
+    values: FloatArray = scipy.fft.rfft(rows, axis=-1)[..., 1:].view(np.float64)
+    return values
 
 
 def _scaled(signal: FloatArray) -> FloatArray:
@@ -62,13 +62,13 @@ def _history(v: FloatArray) -> list[FloatArray]:
     """Return what the input's history shows, of an input within -1 and 1."""
     rate = np.gradient(v)
     way = rate / (np.abs(rate) + 0.1 * float(np.sqrt(np.mean(rate**2))) + 1e-300)
-    found = [way, v * way, v**2 * way]
+    items = [way, v * way, v**2 * way]
     times = np.geomspace(_FASTEST, max(v.size / _SLOWEST, 2.0 * _FASTEST), _LAGS)
     decays = np.exp(-1.0 / times)
-    found += [filtered([1.0 - r], [1.0, -r], v - v[0]) for r in decays]
+    items += [filtered([1.0 - r], [1.0, -r], v - v[0]) for r in decays]
     turns = reversals(v, _TURN * 2.0)
     if not 0 < turns.size <= _TURNS:
-        return found
+        return items
     edges = [0, *turns.tolist(), v.size - 1]
     widths = 2.0 * np.array(_PLAYS)
     play, at = np.empty((v.size, widths.size)), np.full(widths.size, v[0])
@@ -80,8 +80,8 @@ def _history(v: FloatArray) -> list[FloatArray]:
     last = np.repeat(edges[:-1], np.diff(edges) + np.r_[np.zeros(len(edges) - 2, int), 1])
     since = np.abs(v - v[last])
     side = np.sign(v[np.repeat(edges[1:], np.diff([*edges[:-1], v.size]))] - v[last])
-    found += [np.exp(-since / (2.0 * w)) * side for w in _WAYS]
-    return [*found, *play.T]
+    items += [np.exp(-since / (2.0 * w)) * side for w in _WAYS]
+    return [*items, *play.T]
 
 
 def followed(signal: FloatArray, columns: FloatArray, colour: Colour) -> tuple[FloatArray, float]:
@@ -112,8 +112,8 @@ def followed(signal: FloatArray, columns: FloatArray, colour: Colour) -> tuple[F
         left = max(power - float(cross[chosen] @ weights), 1e-12 * power)
     if not chosen:
         return none
-    found: FloatArray = weights @ columns[chosen]
-    return found, least * len(chosen)
+    values: FloatArray = weights @ columns[chosen]
+    return values, least * len(chosen)
 
 
 def _solved(normal: FloatArray, chosen: list[int], right: FloatArray) -> FloatArray:
@@ -156,5 +156,5 @@ def returning(signal: FloatArray, index: IndexArray, period: float) -> tuple[Flo
     cell = phase.astype(np.int64) % _PHASES
     count = np.bincount(cell, minlength=_PHASES)
     mean = np.bincount(cell, weights=signal, minlength=_PHASES) / np.maximum(count, 1)
-    found = np.asarray(np.interp(phase, np.arange(_PHASES) + 0.5, mean, period=_PHASES))
-    return found, 0.5 * _PHASES * float(np.log(signal.size))
+    result = np.asarray(np.interp(phase, np.arange(_PHASES) + 0.5, mean, period=_PHASES))
+    return result, 0.5 * _PHASES * float(np.log(signal.size))

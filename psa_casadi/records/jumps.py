@@ -120,12 +120,12 @@ def steps_in(signal: FloatArray, colour: Colour) -> Jumps | None:
         if not more.size or places.size > _MANY:
             break
         places, levels = _fitted(signal, places, colour)
-        own = colour_of(signal - levels)
-        value = score(signal - levels, own) - 1.5 * places.size * float(np.log(n))
+        item = colour_of(signal - levels)
+        value = score(signal - levels, item) - 1.5 * places.size * float(np.log(n))
         if value < least:
             break
         best, least = Jumps(levels, places, value), value
-        colour = colour if colour is WHITE else own
+        colour = colour if colour is WHITE else item
     few = best is None or best.places.size <= _MOST or best.alternate
     return best if few else None
 

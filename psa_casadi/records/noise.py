@@ -36,13 +36,13 @@ def filtered(
 
     Both hold the coefficients of z^0, z^-1 ...; the first one of `lower` is 1.
     """
-    found = upper[0] * x
+    values = upper[0] * x
     for k, weight in enumerate(upper[1 : len(x)], 1):
-        found[k:] += weight * x[:-k]
+        values[k:] += weight * x[:-k]
     if len(lower) == 1 or not x.size:
-        return found
+        return values
     bands = np.repeat(np.asarray(lower, dtype=float)[: len(x), None], len(x), axis=1)
-    solved = scipy.linalg.lapack.dtbtrs(bands, found.reshape(len(x), -1), uplo="L")[0]
+    solved = scipy.linalg.lapack.dtbtrs(bands, values.reshape(len(x), -1), uplo="L")[0]
     recursive: FloatArray = solved.reshape(x.shape)
     return recursive
 
@@ -94,8 +94,8 @@ def lines_in(power: FloatArray) -> tuple[IndexArray, FloatArray]:
     limit = 1.4 * around * (np.log(power.size) - np.log(_CHANCE))
     inner = np.arange(max(_LOWEST, 3), power.size - 3)
     highest = np.max([power[inner + d] for d in (-3, -2, -1, 1, 2, 3)], axis=0)
-    found = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
-    return found[np.argsort(-power[found])[:_LINES]], around
+    result = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
+    return result[np.argsort(-power[result])[:_LINES]], around
 
 
 def growth(squares: FloatArray, sizes: FloatArray) -> tuple[float, float]:
@@ -181,9 +181,9 @@ def local_scale(away: FloatArray) -> FloatArray:
     return np.repeat(each, [size + (k < longer) for k in range(count)])
 
 
-def runs_of(found: BoolArray) -> list[tuple[int, int]]:
+def runs_of(mask: BoolArray) -> list[tuple[int, int]]:
     """Return the first sample of every run of True in (n,), and the one behind its last."""
-    edges = np.flatnonzero(np.diff(np.r_[False, found, False].astype(np.int8))).tolist()
+    edges = np.flatnonzero(np.diff(np.r_[False, mask, False].astype(np.int8))).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
@@ -220,8 +220,8 @@ def high_frequency_noise(signal: FloatArray) -> float:
     length = int(np.clip(len(squares) // _BLOCKS, 1, _BLOCK))
     count = len(squares) // length
     powers = np.mean(squares[: count * length].reshape(count, length), axis=1)
-    alike = sum((1.0 - k / length) * r for k, r in enumerate(_SQUARES, 1) if k < length)
-    freedom = length / (1.0 + 2.0 * alike)  # of the mean square of so many third differences
+    similar = sum((1.0 - k / length) * r for k, r in enumerate(_SQUARES, 1) if k < length)
+    freedom = length / (1.0 + 2.0 * similar)  # of the mean square of so many third differences
     power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
     return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
 
@@ -309,8 +309,8 @@ def lag_products(d: FloatArray, lags: int) -> FloatArray:
     """Return sum_i d_i d_(i+k) for k < lags."""
     size = scipy.fft.next_fast_len(d.size + lags, real=True)
     result = np.zeros(lags)
-    found = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
-    result[: found.size] = found
+    matches = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
+    result[: matches.size] = matches
     return result
 
 

@@ -90,20 +90,20 @@ class NoiseFound:
     kinds: tuple[NoiseKind, ...]
 
 
-def notes_of(found: Sequence[NoiseFound]) -> tuple[Note, ...]:
+def notes_of(noise_founds: Sequence[NoiseFound]) -> tuple[Note, ...]:
     """Return what is said of noises, one note for each kind in each output, the figures of one.
 
     White noise, and a misfit, need no word.
     """
-    several = len({f.output for f in found}) > 1
-    told: dict[tuple[str, str], tuple[NoiseFound, NoiseKind, list[str]]] = {}
-    for f in found:
+    several = len({f.output for f in noise_founds}) > 1
+    table: dict[tuple[str, str], tuple[NoiseFound, NoiseKind, list[str]]] = {}
+    for f in noise_founds:
         for k in f.kinds:
-            names = told.setdefault((f.output, k.kind), (f, k, []))[2]
+            names = table.setdefault((f.output, k.kind), (f, k, []))[2]
             names.append(f"{f.output} in {f.record}" if several else f.record)
     return tuple(
         note("noise_kind", where=(*names,), unit=f.unit, kind=k.kind, figures=k.figures, at=k.at)
-        for f, k, names in told.values()
+        for f, k, names in table.values()
         if k.kind not in ("white", "misfit")
     )
 
@@ -125,23 +125,23 @@ def noise_kinds(
     if np.count_nonzero(there) < FEWEST or not np.ptp((reading - predicted)[there]) > 0.0:
         return ()
     dt = float(np.median(np.diff(time)))
-    found = _dropped(time, dt)
+    result = _dropped(time, dt)
     quantum = quantum_of(reading[there]) or 0.0
     again = _held(reading, predicted, there, quantum)
     there = there & ~again
     if again.any():
         share = again.sum() / (again.sum() + there.sum())
         ends = np.diff(np.flatnonzero(there), prepend=-1, append=there.size)
-        found.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
+        result.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
     index = np.flatnonzero(there)
     if index.size < FEWEST:
-        return tuple(found)
+        return tuple(result)
     residual = (reading - predicted)[there]
     rms = float(np.std(residual))
     if rms <= _ROUNDED * quantum / np.sqrt(12.0):
-        return (*found, NoiseKind("quantised", {"step": quantum, "rms": rms}))
-    seen = _Seen(time, predicted, tuple(inputs), index, dt, residual)
-    return (*found, *seen.kinds())
+        return (*result, NoiseKind("quantised", {"step": quantum, "rms": rms}))
+    observed = _Seen(time, predicted, tuple(inputs), index, dt, residual)
+    return (*result, *observed.kinds())
 
 
 def _dropped(time: FloatArray, dt: float) -> list[NoiseKind]:
@@ -189,13 +189,13 @@ class _Seen:
         flat = self.residual - np.mean(self.residual)
         robust = _robust(flat)
         jumps, misfit, colour = self._parts(robust)
-        found = [] if jumps is None else [self._jumping(jumps)]
+        result = [] if jumps is None else [self._jumping(jumps)]
         left = robust - misfit - (0.0 if jumps is None else jumps.levels)
         if misfit.any():
             share = 1.0 - float(left @ left) / max(float(np.sum((left + misfit) ** 2)), 1e-300)
-            found.append(NoiseKind("misfit", {"share": share}))
+            result.append(NoiseKind("misfit", {"share": share}))
         lines, of_drive, tones = self._tones(left, beside=bool(misfit.any()))
-        found += lines
+        result += lines
         if tones.any():
             left = left - tones
             colour = colour_of(left)
@@ -205,18 +205,18 @@ class _Seen:
         new = float(np.var(white) / np.var(left)) if colour.family == "autoregressive" else 1.0
         smooth = colour.figures.get("slope", 0.0) > _SMOOTH or new < _PREDICTED
         white = white + flat - robust
-        told = colour.told and not smooth and not of_drive and self._is_noise(left, misfit)
-        sure = colour is WHITE or told
+        output = colour.told and not smooth and not of_drive and self._is_noise(left, misfit)
+        sure = colour is WHITE or output
         figures = colour.figures if sure else {"time": forgets(lag_products(left, left.size // 2))}
         units = {"time": self.dt, "corner": 1.0 / self.dt, "peak": 1.0 / self.dt}
         figures = {name: value * units.get(name, 1.0) for name, value in figures.items()}
         kind = colour.family if sure else "coloured"
-        found.append(NoiseKind(kind, {"rms": float(np.std(left)), **figures}))
+        result.append(NoiseKind(kind, {"rms": float(np.std(left)), **figures}))
         if jumps is not None and jumps.alternate:
-            return found
+            return result
         if jumps is not None:
             white[np.clip(jumps.places[:, None] + np.arange(-2, 2), 0, white.size - 1)] = 0.0
-        return found + self._innovations(white, sure and jumps is None, (flat != robust) | sure)
+        return result + self._innovations(white, sure and jumps is None, (flat != robust) | sure)
 
     def _parts(self, robust: FloatArray) -> tuple[Jumps | None, FloatArray, Colour]:
         """Return jumps, what follows the drive, and the colour of the rest: the likeliest ones."""
@@ -242,18 +242,18 @@ class _Seen:
         best, highest = (np.zeros_like(robust), 0.0, colour), score(robust, colour)
         for weight in (WHITE, colour):
             misfit, price = followed(robust, self.columns, weight)
-            own = colour_of(robust - misfit)
-            value = score(robust - misfit, own) - price
+            item = colour_of(robust - misfit)
+            value = score(robust - misfit, item) - price
             share = 1.0 - float(np.var(robust - misfit)) / float(np.var(robust))
             if value > highest + LEAST and share > 0.0:
-                best, highest = (misfit, price, own), value
+                best, highest = (misfit, price, item), value
             elif share > _MUCH and value > highest - LEAST:
                 best = *best[:2], replace(best[2], told=False)
         if self.period is not None and best[2] is not WHITE:
             again, cost = returning(robust - best[0], self.index, self.period)
-            own = colour_of(robust - best[0] - again)
-            if score(robust - best[0] - again, own) - best[1] - cost > highest + LEAST:
-                best = best[0] + again, best[1] + cost, own
+            item = colour_of(robust - best[0] - again)
+            if score(robust - best[0] - again, item) - best[1] - cost > highest + LEAST:
+                best = best[0] + again, best[1] + cost, item
         return best
 
     def _tones(self, left: FloatArray, *, beside: bool) -> tuple[list[NoiseKind], bool, FloatArray]:
@@ -265,16 +265,16 @@ class _Seen:
         place = self.index - self.index[0]
         even = np.zeros(int(place[-1]) + 1)
         even[place] = np.where(left == 0.0, 1e-300, left)
-        found, rest = tones_in(even)
+        result, rest = tones_in(even)
         at, largest = list[float](), 0.0
-        for tone in found:
+        for tone in result:
             hertz = tone.frequency / self.dt
             of_drive = any(self._of_drive(tone.frequency, u[part]) for u in self.inputs)
             if not of_drive and (not beside or is_mains(hertz)):
                 at.append(hertz)
                 largest = max(largest, tone.amplitude)
         kinds = [NoiseKind("lines", {"amplitude": largest}, (*at,))] if at else []
-        return kinds, len(at) < len(found), left - rest[place]
+        return kinds, len(at) < len(result), left - rest[place]
 
     def _of_drive(self, frequency: float, drive: FloatArray) -> bool:
         """Whether a line may be the drive's: a line of it, or a harmonic of its strongest line."""
@@ -286,10 +286,10 @@ class _Seen:
         first = dominant_line(power)
         if first is None:
             return False
-        own = drive.size / self.period if self.period else centre_of(power, first)
-        wide = min(_SHARP / own, _BROAD) if self.period else _BROAD
-        order = round(place / own)
-        return order <= _HARMONICS and abs(place / own - order) < wide
+        item = drive.size / self.period if self.period else centre_of(power, first)
+        wide = min(_SHARP / item, _BROAD) if self.period else _BROAD
+        order = round(place / item)
+        return order <= _HARMONICS and abs(place / item - order) < wide
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -331,8 +331,8 @@ class _Seen:
         for x in (values, away, rate, np.abs(rate)):
             bins = np.searchsorted(np.quantile(x, np.arange(1, 8) / 8.0), x)
             each = np.bincount(bins) * (places.size / x.size)
-            own = np.bincount(bins[places], minlength=each.size)
-            apart = (own - each)[each > 0.0] ** 2 / each[each > 0.0]
+            item = np.bincount(bins[places], minlength=each.size)
+            apart = (item - each)[each > 0.0] ** 2 / each[each > 0.0]
             chances.append(scipy.special.chdtrc(max(apart.size - 1, 1), float(apart.sum())))
         return bool(min(chances) < _NO_CHANCE)
 
@@ -341,7 +341,7 @@ class _Seen:
 
         Outliers alone where these are not the `whole` noise.
         """
-        found, tails = list[NoiseKind](), (0.0, 0.0)
+        result, tails = list[NoiseKind](), (0.0, 0.0)
         scale = 1.4826 * float(np.median(np.abs(white[white != 0.0])))
         z = white / max(scale, 1e-300)
         if whole:
@@ -349,7 +349,7 @@ class _Seen:
             jitter, grows = (_grown(z, x) for x in (rate, self.predicted[self.index]))
             gain, size, deviation = best = max(jitter, grows, key=lambda g: g[0])
             if gain > LEAST:
-                found.append(
+                result.append(
                     NoiseKind("jitter", {"rms": size * scale})
                     if best is jitter
                     else NoiseKind("grows", {"share": size * scale})
@@ -358,11 +358,11 @@ class _Seen:
             tails = _tails(z)
         gain, where = _outliers(z)
         if tails[0] > max(gain, LEAST):
-            return [*found, NoiseKind("heavy_tails", {"freedom": tails[1]})]
+            return [*result, NoiseKind("heavy_tails", {"freedom": tails[1]})]
         places = np.flatnonzero(where & spikes)
         if gain < LEAST or not places.size or self._with_drive(places):
-            return found
-        return [*found, NoiseKind("outliers", {"count": float(places.size)}, self._times(places))]
+            return result
+        return [*result, NoiseKind("outliers", {"count": float(places.size)}, self._times(places))]
 
 
 #: A drive's harmonics up to this one are its own, to this many of the record's resolutions, or to
@@ -410,9 +410,9 @@ def _grown(z: FloatArray, x: FloatArray) -> tuple[float, float, FloatArray]:
     grown = 1.0 + ratio * size
     level = float(np.mean(limited / grown))
     centred, near = size - np.mean(size), np.clip(z, -5.0, 5.0)
-    beside = abs(float(centred[1:] @ (near[1:] * near[:-1])))
+    others = abs(float(centred[1:] @ (near[1:] * near[:-1])))
     error = float(np.std(limited) * np.linalg.norm(centred))
-    if beside > _NEIGHBOURS * float(centred @ limited) + _ERRORS * error:
+    if others > _NEIGHBOURS * float(centred @ limited) + _ERRORS * error:
         gain = 0.0
     each = float(np.sqrt(ratio * level / power))
     return gain - 0.5 * float(np.log(z.size)), each, np.sqrt(level * grown)

@@ -71,8 +71,8 @@ class Colour:
     def covariance(self, n: int) -> FloatArray:
         """Return the shape of the autocovariance (n,) that belongs to the spectrum."""
         shape = self.density(np.maximum(np.arange(n // 2 + 1), 1) / n)
-        found: FloatArray = scipy.fft.irfft(shape, n)
-        return found
+        values: FloatArray = scipy.fft.irfft(shape, n)
+        return values
 
 
 WHITE = Colour("white", 0.0, {}, np.ones_like)
@@ -99,15 +99,15 @@ def colour_of(signal: FloatArray) -> Colour:
     or on white noise. One that cannot be told from the best one of another family is not `told`.
     """
     flat = straightened(signal)
-    seen = _Periodogram(flat)
-    power = _power(seen)
-    found = [*_autoregressive(seen, flat), _lag(seen), power]
-    best = max(found, key=lambda c: c.gain)
+    observed = _Periodogram(flat)
+    power = _power(observed)
+    items = [*_autoregressive(observed, flat), _lag(observed), power]
+    best = max(items, key=lambda c: c.gain)
     if best.gain < LEAST:
         return WHITE
     if best.figures.get("time", 0.0) > flat.size / _WANDERS and power.gain > best.gain - NEAR:
         return power  # what forgets so slowly has a spectrum of f^-2
-    others = [c.gain for c in found if c.family != best.family]
+    others = [c.gain for c in items if c.family != best.family]
     return replace(best, told=best.gain - max(others, default=-np.inf) > NEAR)
 
 
@@ -127,8 +127,8 @@ class _Periodogram:
         lines = float(np.sum(self.count))
         level = (self.power / shape) @ self.count / (self.power @ self.count)
         price = 0.5 * parameters * float(np.log(self.n))
-        found: FloatArray = -np.log(shape) @ self.count - lines * np.log(level) - price
-        return found
+        values: FloatArray = -np.log(shape) @ self.count - lines * np.log(level) - price
+        return values
 
     def sought(
         self, shape: Callable[..., FloatArray], *ranges: tuple[float, float]
@@ -144,49 +144,54 @@ class _Periodogram:
         return *best, float(values[i, j]), partial(shape, *best)
 
 
-def _autoregressive(seen: _Periodogram, flat: FloatArray) -> list[Colour]:
+def _autoregressive(periodogram: _Periodogram, flat: FloatArray) -> list[Colour]:
     a = autoregression_of(flat)
     if not a.size:
         return []
 
     def density(f: FloatArray) -> FloatArray:
         turn = np.polyval(np.r_[-a[::-1], 1.0], np.exp(-2j * np.pi * f))
-        found: FloatArray = 1.0 / np.maximum(np.abs(turn) ** 2, 1e-12)
-        return found
+        values: FloatArray = 1.0 / np.maximum(np.abs(turn) ** 2, 1e-12)
+        return values
 
-    gain = float(seen.gain(density(seen.frequency), a.size))
-    found = Colour("autoregressive", gain, {}, density)
-    figures = {"order": float(a.size), "time": forgets(found.covariance(seen.n)[: seen.n // 2])}
+    gain = float(periodogram.gain(density(periodogram.frequency), a.size))
+    values = Colour("autoregressive", gain, {}, density)
+    figures = {
+        "order": float(a.size),
+        "time": forgets(values.covariance(periodogram.n)[: periodogram.n // 2]),
+    }
     f = np.linspace(0.5 / flat.size, 0.5, 1024)
     peak = int(np.argmax(density(f)))
     if 0 < peak < f.size - 1:
         figures["peak"] = float(f[peak])
-    return [replace(found, figures=figures)]
+    return [replace(values, figures=figures)]
 
 
-def _lag(seen: _Periodogram) -> Colour:
+def _lag(periodogram: _Periodogram) -> Colour:
     """First-order autoregression on white noise: 1 + c / |1 - r z|^2, c over its largest."""
 
     def shape(memory: FloatArray, size: FloatArray, f: FloatArray) -> FloatArray:
         r = np.exp(-np.exp(-memory))
         low = (1.0 - r) ** 2
-        found: FloatArray = 1.0 + np.exp(size) * low / (low + 4.0 * r * np.sin(np.pi * f) ** 2)
-        return found
+        values: FloatArray = 1.0 + np.exp(size) * low / (low + 4.0 * r * np.sin(np.pi * f) ** 2)
+        return values
 
-    memory, _, gain, density = seen.sought(shape, (-0.7, np.log(seen.n / 4.0)), (-3.0, 14.0))
+    memory, _, gain, density = periodogram.sought(
+        shape, (-0.7, np.log(periodogram.n / 4.0)), (-3.0, 14.0)
+    )
     return Colour("autoregressive", gain, {"order": 1.0, "time": float(np.exp(memory))}, density)
 
 
-def _power(seen: _Periodogram) -> Colour:
+def _power(periodogram: _Periodogram) -> Colour:
     """Spectrum 1 + (corner / f)^a; the corner may lie beyond all frequencies."""
 
     def shape(slope: FloatArray, corner: FloatArray, f: FloatArray) -> FloatArray:
-        found: FloatArray = 1.0 + np.exp(slope * (corner - np.log(f)))
-        return found
+        values: FloatArray = 1.0 + np.exp(slope * (corner - np.log(f)))
+        return values
 
-    slope, corner, gain, density = seen.sought(shape, _SLOPES, (-np.log(seen.n), 4.0))
+    slope, corner, gain, density = periodogram.sought(shape, _SLOPES, (-np.log(periodogram.n), 4.0))
     pure = float(np.log(0.5)) < corner - 1.0
-    gain += 0.5 * float(np.log(seen.n)) * pure
+    gain += 0.5 * float(np.log(periodogram.n)) * pure
     figures = {"slope": slope} if pure else {"slope": slope, "corner": float(np.exp(corner))}
     return Colour("one_over_f", gain, figures, density)
 
@@ -221,9 +226,9 @@ def tones_in(signal: FloatArray) -> tuple[list[Tone], FloatArray]:
     The strongest is taken off before the next one is sought. Each is fitted by least squares, to
     first order in its frequency.
     """
-    left, found = signal.copy(), list[Tone]()
+    left, result = signal.copy(), list[Tone]()
     there, t = signal != 0.0, np.linspace(-1.0, 1.0, signal.size)
-    while len(found) < _MOST:
+    while len(result) < _MOST:
         power, lines = line_spectrum(left)
         if not lines.size:
             break
@@ -233,5 +238,5 @@ def tones_in(signal: FloatArray) -> tuple[list[Tone], FloatArray]:
         columns = np.column_stack([pair, pair * t[:, None]])
         weights = np.linalg.solve(columns.T @ columns, columns.T @ left)
         left = left - columns @ weights
-        found.append(Tone(frequency, float(np.hypot(*weights[:2]))))
-    return found, left
+        result.append(Tone(frequency, float(np.hypot(*weights[:2]))))
+    return result, left

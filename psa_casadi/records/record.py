@@ -37,8 +37,8 @@ class Located:
 
     def part(self, where: slice) -> "Located":
         """Return some of the values."""
-        own = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
-        return replace(self, **own)
+        table = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
+        return replace(self, **table)
 
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
@@ -59,9 +59,9 @@ def check_time(time: Located, problems: Problems) -> None:
     wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
     if wrong.size > LISTED:
         first, places = known[wrong[0] + 1], f"{time.place}s"
-        stands = (time.values[known[wrong]] == time.values[known[wrong + 1]]).all()
+        advices = (time.values[known[wrong]] == time.values[known[wrong + 1]]).all()
         what = f": the {places} are not in the order of time; sort them by it."
-        what = f": their time stands still; remove repeated {places}." if stands else what
+        what = f": their time stands still; remove repeated {places}." if advices else what
         problems.add(
             f"{time.path}: column 'time': {wrong.size} of {time.values.size} {places} are not later"
             f" than the one before, {time.place} {time.lines[first]} the first of them{what}"
@@ -106,7 +106,7 @@ def check_finite(column: Located, problems: Problems, *, complete: bool = False)
     What was reported already is not told again.
     """
     values, place = column.values, column.place
-    for at, told in (
+    for at, output in (
         (np.isnan(values) & complete, "found no value, expected a number; fill"),
         (np.isinf(values), "found {}, expected a finite number; correct"),
         (
@@ -118,7 +118,7 @@ def check_finite(column: Located, problems: Problems, *, complete: bool = False)
         for row in rows[:LISTED]:
             problems.add(
                 f"{column.path}: {place} {column.lines[row]}, column '{column.name}':"
-                f" {told.format(f'{values[row]:.6g}')} the cell or remove the {place}."
+                f" {output.format(f'{values[row]:.6g}')} the cell or remove the {place}."
             )
         problems.add_uncounted(max(0, rows.size - LISTED))
 
@@ -196,10 +196,10 @@ class Record(Signals):
     def __post_init__(self) -> None:
         problems, where = Problems(), f"record '{self.name}'"
         for column in COLUMNS:
-            given = getattr(self, column)
-            if given is None and column in _OPTIONAL:
+            inputs = getattr(self, column)
+            if inputs is None and column in _OPTIONAL:
                 continue
-            array = frozen(given)
+            array = frozen(inputs)
             object.__setattr__(self, column, array)
             if array.ndim != 1 or array.size != self.time.size:
                 problems.add(

@@ -71,7 +71,7 @@ def repetitions(record: Record) -> list[Repetition]:
     if record.n < 2 * FEWEST or not np.ptp(record.voltage) > 0:
         return []
     rows = {lag: _runs(record, lag) for lag in _candidates(record.voltage)}
-    sizes = {lag: sum(r.stop - r.settled for r in found) for lag, found in rows.items()}
+    sizes = {lag: sum(r.stop - r.settled for r in result) for lag, result in rows.items()}
     best = max(sizes.values(), default=0)
     good = sorted(lag for lag, size in sizes.items() if size > 0 and size >= 0.5 * best)
     return [r for lag in good[:DISTANCES] for r in rows[lag]]
@@ -124,7 +124,7 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
     later = record.time[lag:] - record.time[:-lag]
     same &= np.abs(later - np.median(later)) <= 0.25 * record.sample_time
     longest = sorted(runs_of(same), key=lambda run: run[0] - run[1])[:RUNS]
-    found = []
+    items = []
     for start, stop in sorted(longest):
         if stop - start < FEWEST:
             continue
@@ -135,8 +135,8 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
         settled = start + lead
         moved = float(np.ptp(record.voltage[settled:stop]))
         if stop - settled >= FEWEST and moved >= MOVES * float(np.ptp(record.voltage)):
-            found.append(Repetition(lag, start, settled, min(stop, settled + ENOUGH)))
-    return found
+            items.append(Repetition(lag, start, settled, min(stop, settled + ENOUGH)))
+    return items
 
 
 def _same(signal: FloatArray, lag: int) -> BoolArray:
@@ -195,17 +195,17 @@ def repeats(record: Record) -> Repeats | None:
     """
     if record.displacement is None:
         return None
-    found = repetitions(record)
-    if not found:
+    result = repetitions(record)
+    if not result:
         return None
     pieces = []
-    for r in found:
+    for r in result:
         first, second = slice(r.settled, r.stop), slice(r.settled + r.lag, r.stop + r.lag)
         change = record.displacement[second] - record.displacement[first]
         apart = record.voltage[second] - record.voltage[first]
         if np.count_nonzero(np.isfinite(change)) >= FEWEST:
             pieces.append(_without_drift(change, apart, r.lag))
-    apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in found}
+    apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in result}
     noise = _pooled(pieces, 0.5, len(apart_s))
     if noise is None:
         return None

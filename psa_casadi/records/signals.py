@@ -127,22 +127,22 @@ def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
     two samples close together is none.
     """
     steps = np.diff(signals.time)
-    wide, found = steps > 0.5 * float(np.median(steps)), []
+    wide, result = steps > 0.5 * float(np.median(steps)), []
     for name in names:
         moves = np.diff(signals.columns[name]) != 0.0
         alone = (moves & wide)[1:-1] & ~moves[:-2] & ~moves[2:]
         jumps = int(np.count_nonzero(alone))
         if jumps >= _JUMPS and jumps >= _NEARLY_ALL * np.count_nonzero(moves):
-            found.append(name)
-    return tuple(found)
+            result.append(name)
+    return tuple(result)
 
 
 def in_parts(records: Iterable[Any]) -> list[tuple[str, list[Any]]]:
     """Return the parts of every record (`slice`), each by the name of the whole."""
-    found: dict[tuple[str, str], list[Any]] = {}
+    table: dict[tuple[str, str], list[Any]] = {}
     for r in records:
-        found.setdefault((r.name.partition("[")[0], r.sha256), []).append(r)
-    return [(name if own[1:] else own[0].name, own) for (name, _), own in found.items()]
+        table.setdefault((r.name.partition("[")[0], r.sha256), []).append(r)
+    return [(name if item[1:] else item[0].name, item) for (name, _), item in table.items()]
 
 
 def frozen(values: npt.ArrayLike) -> FloatArray:

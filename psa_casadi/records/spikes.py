@@ -35,9 +35,9 @@ def spikes_in(
     `inputs` (n, nu) are known throughout. A spike has at most `longest` samples and stands out by
     `limit` standard deviations of the residual around it and by `smallest`, in the output's unit.
     """
-    found = np.zeros(y.size, dtype=np.bool_)
+    mask = np.zeros(y.size, dtype=np.bool_)
     if np.isfinite(y).sum() < _ROWS:
-        return found
+        return mask
     moving = inputs[:, np.ptp(inputs, axis=0) > 0.0]
     sides = [j for j in range(-_REACH, _REACH + 1) if j]
     near = [y, *(moving[:, k] for k in range(moving.shape[1]))]
@@ -55,7 +55,7 @@ def spikes_in(
     )
     for _ in range(_ROUNDS):
         if used.sum() < _ROWS * table.shape[1]:
-            return found
+            return mask
         weights = np.linalg.lstsq(table[used], near[0][used], rcond=1e-10)[0]
         left = np.where(good, near[0] - np.where(good[:, None], table, 0.0) @ weights, 0.0)
         size = np.abs(left)
@@ -77,15 +77,15 @@ def spikes_in(
     pattern[[_REACH - j for j in sides]] = -weights[: len(sides)]
     for start, stop in runs_of(_grown(good & (size > allowed))):
         place = _pursued(left[start:stop], pattern, allowed[start:stop], limit, longest)
-        found[start + np.array(place, dtype=np.intp)] = True
-    for start, stop in runs_of(found):
+        mask[start + np.array(place, dtype=np.intp)] = True
+    for start, stop in runs_of(mask):
         if stop - start > longest:
-            found[start:stop] = False
-    return found
+            mask[start:stop] = False
+    return mask
 
 
-def _grown(found: BoolArray) -> BoolArray:
-    return scipy.ndimage.maximum_filter1d(found, 2 * _REACH + 1)
+def _grown(mask: BoolArray) -> BoolArray:
+    return scipy.ndimage.maximum_filter1d(mask, 2 * _REACH + 1)
 
 
 def _pursued(
@@ -100,10 +100,10 @@ def _pursued(
     sizes = np.linalg.norm(each, axis=0)
 
     def tried(places: list[int], share: float) -> tuple[bool, FloatArray]:
-        found = np.linalg.lstsq(each[:, places], left, rcond=None)[0]
-        rest = left - each[:, places] @ found
-        most = np.maximum(_UNUSUAL * allowed / limit, share * float(np.max(np.abs(found))))
-        large = bool(np.all(np.abs(found) > allowed[places]))
+        result = np.linalg.lstsq(each[:, places], left, rcond=None)[0]
+        rest = left - each[:, places] @ result
+        most = np.maximum(_UNUSUAL * allowed / limit, share * float(np.max(np.abs(result))))
+        large = bool(np.all(np.abs(result) > allowed[places]))
         return large and bool(np.all(np.abs(rest) <= most)), rest
 
     places, rest = list[int](), left

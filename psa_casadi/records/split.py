@@ -82,12 +82,12 @@ def loop_sizes(records: Sequence[Record], span: float) -> int:
 
 def counts(records: Sequence[Record], chosen: Sequence[BoolArray], span: float) -> dict[Kind, int]:
     """Return how many of the `chosen` samples of the records belong to each kind."""
-    found: dict[Kind, int] = {}
+    table: dict[Kind, int] = {}
     for record, mask in zip(records, chosen, strict=True):
         kinds, which = stretches(record, span)
         for kind, count in zip(kinds, np.bincount(which[mask], minlength=len(kinds)), strict=True):
-            found[kind] = found.get(kind, 0) + int(count)
-    return {k: n for k, n in found.items() if n}
+            table[kind] = table.get(kind, 0) + int(count)
+    return {k: n for k, n in table.items() if n}
 
 
 #: An interval is a gap from so many times the intervals beside it on.
@@ -106,7 +106,7 @@ def without_gaps(
     gap is not what a straight line of the voltage would have left.
     """
     parts: list[_Given] = []
-    said = []
+    items = []
     for record in records:
         at: tuple[int, ...] = gaps(record, inputs)
         if not at:
@@ -119,11 +119,11 @@ def without_gaps(
             for k in at
         )
         what = f"the {inputs[0]}" if len(inputs) == 1 else "an input"
-        said.append(
+        items.append(
             f"{record.name}: no sample for {places}, while {what} moves: what it did there is"
             f" not known, so that the {len(at) + 1} parts count as records of their own."
         )
-    return parts, said
+    return parts, items
 
 
 def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tuple[int, ...]:
@@ -139,17 +139,17 @@ def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tupl
     hidden = np.zeros(inner.size, dtype=np.bool_)
     for values in [c for n in inputs if (c := record.column(n)) is not None]:
         change = np.diff(values)
-        missed = [
+        items = [
             np.abs(change[inner] - step[inner] * change[side] / step[side])
             for side in (inner - 1, inner + 1)
         ]
-        hidden |= np.maximum(*missed) > HIDDEN * np.ptp(values)
-    found: list[int] = []
+        hidden |= np.maximum(*items) > HIDDEN * np.ptp(values)
+    numbers: list[int] = []
     for k in inner[(step[inner] > _LONG * around) & hidden].tolist():
-        begin = found[-1] + 1 if found else 0
+        begin = numbers[-1] + 1 if numbers else 0
         if k + 1 - begin >= FEWEST_SAMPLES and record.n - (k + 1) >= FEWEST_SAMPLES:
-            found.append(k)
-    return tuple(found)
+            numbers.append(k)
+    return tuple(numbers)
 
 
 #: Number of blocks a record is cut into, and of how many one is held out when no record is named.
@@ -223,8 +223,8 @@ class Experiment:
     @property
     def known(self) -> BoolArray:
         """The samples that are not held out: the used ones, or those that find the beginning."""
-        found: BoolArray = self.record.mask & ~self.held_out
-        return found
+        mask: BoolArray = self.record.mask & ~self.held_out
+        return mask
 
     @property
     def stop(self) -> int:
@@ -246,10 +246,10 @@ class Experiment:
 
     def at(self, channel: int, samples: BoolArray | None = None) -> BoolArray:
         """Return which of the samples, by default the used ones, have a reading of a channel."""
-        found: BoolArray = (self.used if samples is None else samples) & np.isfinite(
+        mask: BoolArray = (self.used if samples is None else samples) & np.isfinite(
             self.measured(channel)
         )
-        return found
+        return mask
 
 
 def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
@@ -260,10 +260,10 @@ def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
 
 
 def missed_rms(
-    experiments: Sequence[Experiment], shown: Sequence[FloatArray], channel: int
+    experiments: Sequence[Experiment], arrays: Sequence[FloatArray], channel: int
 ) -> float:
     """Return the rms of measured minus predicted of a channel, in its unit, over these samples."""
-    rows = zip(experiments, shown, counted(experiments, channel), strict=True)
+    rows = zip(experiments, arrays, counted(experiments, channel), strict=True)
     errors = np.concatenate([(e.measured(channel) - y[:, channel])[c] for e, y, c in rows])
     return float(np.sqrt(np.mean(errors**2)))
 
@@ -341,7 +341,7 @@ def _held_out(record: Record, index: IndexArray) -> tuple[int, ...]:
     near = np.array([[float(k.near(other)) for other in kinds] for k in kinds])
 
     def missed(choice: tuple[int, ...]) -> int:
-        return sum(found <= set(choice) for found in extremes)
+        return sum(result <= set(choice) for result in extremes)
 
     def unlike(choice: tuple[int, ...]) -> float:
         whole = np.sum(shares, axis=1)
@@ -389,40 +389,40 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     for done, k in enumerate(sorted(range(len(records)), key=lambda k: records[k].n)):
         shares[k] = min(records[k].n, max(LEAST, left // (len(records) - done)))
         left -= shares[k]  # what short ones leave is the others'
-    found: list[Record] = []
-    said: list[str] = []
+    result: list[Record] = []
+    texts: list[str] = []
     for record, share in zip(records, shares, strict=True):
         if record.n <= share:
-            found.append(record)
+            result.append(record)
             continue
         length = share // PARTS
-        begins = [k * length for k in _chosen(record, length)]
-        found += [record.slice(a, a + length) for a in begins]
-        places = ", ".join(f"{record.time[a]:.4g} s" for a in begins)
+        items = [k * length for k in _chosen(record, length)]
+        result += [record.slice(a, a + length) for a in items]
+        places = ", ".join(f"{record.time[a]:.4g} s" for a in items)
         lasts = record.time[length] - record.time[0]
-        said.append(
+        texts.append(
             f"{record.name}: of {record.n} samples {PARTS} parts of {length} are used, which begin"
             f" at {places}: they have each kind of rise, fall and hold that fits into them, and"
             f" tell nothing slower than a part, {lasts:.3g} s; give a record with fewer samples a"
             " second for that."
         )
-    return found, said
+    return result, texts
 
 
 def _chosen(record: Record, length: int) -> list[int]:
     """Return which of the parts of a length stand for a record, in the order of time."""
     v, span = record.voltage, float(np.ptp(record.voltage))
     kinds, which = stretches(record, span)
-    shown = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)  # and the two ends
-    last = len(shown) * length
+    displayed = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)  # and the two ends
+    last = len(displayed) * length
     part = np.arange(last) // length
-    shown[part, which[:last]] = True
-    shown[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
-    shown[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
+    displayed[part, which[:last]] = True
+    displayed[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
+    displayed[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
     chosen = [0]
     while len(chosen) < PARTS:
-        new = np.sum(shown & ~np.any(shown[chosen], axis=0), axis=1)
-        away = np.min(np.abs(np.subtract.outer(np.arange(len(shown)), chosen)), axis=1)
+        new = np.sum(displayed & ~np.any(displayed[chosen], axis=0), axis=1)
+        away = np.min(np.abs(np.subtract.outer(np.arange(len(displayed)), chosen)), axis=1)
         new[chosen] = -1
         chosen.append(int(np.lexsort((away, new))[-1]))
     return sorted(chosen)

@@ -86,7 +86,7 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
     share of readings that are repeated, must not be expected where the voltage is fast. Where that
     is how the record answers fast changes in general, the stack is late and no sensor stuck.
     """
-    found = np.zeros(y.size, dtype=np.bool_)
+    result = np.zeros(y.size, dtype=np.bool_)
     centred = voltage - np.mean(voltage)
     power = float(centred @ centred)
     slope = float(centred @ y) / power if power > 0 else 0.0
@@ -98,13 +98,13 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
         # y[start] ... y[stop] are equal, y[stop + 1] is the first new one
         if stop + 1 >= y.size or by_chance[stop - start] > CHANCE:
             continue
-        missed = slope * (voltage[stop] - voltage[start])
-        made_up = (y[stop + 1] - y[stop]) * np.sign(missed)
+        misfit = slope * (voltage[stop] - voltage[start])
+        made_up = (y[stop + 1] - y[stop]) * np.sign(misfit)
         expected = abs(slope * (voltage[stop + 1] - voltage[start]))
-        if abs(missed) > least and made_up > max(least, 0.5 * expected):
-            found[start + 1 : stop + 1] = True
+        if abs(misfit) > least and made_up > max(least, 0.5 * expected):
+            result[start + 1 : stop + 1] = True
     late = fast.any() and float(np.mean(same[fast])) > LATE
-    return np.zeros_like(found) if late else found
+    return np.zeros_like(result) if late else result
 
 
 def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
@@ -115,18 +115,18 @@ def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None)
     that while the voltage changes does not measure; one that repeats often is read more slowly than
     it is sampled.
     """
-    found = np.zeros(y.size, dtype=np.bool_)
+    mask = np.zeros(y.size, dtype=np.bool_)
     noise, same = high_frequency_noise(y), _repeated(y)
     same &= np.diff(voltage) != 0.0
     bands = np.array_split(np.unique(np.abs(y)), BANDS)
     digit = max((float(np.min(np.diff(b))) for b in bands if b.size > 1), default=0.0)
     chance = max(quantum or 0.0, digit) / (2.0 * np.sqrt(np.pi) * max(noise, 1e-300))
     if not _is_noisy(y) or not same.any():
-        return found
+        return mask
     unlikely = scipy.special.pdtrc(int(same.sum()) - 1, chance * same.size) < NO_CHANCE
     if chance < BY_NOISE and unlikely and np.mean(same) < RARELY:
-        found[1:] = same
-    return found
+        mask[1:] = same
+    return mask
 
 
 def _is_noisy(y: FloatArray) -> bool:
@@ -173,7 +173,7 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
     if noise <= last_place_of(y):  # digits that are as coarse make a drive's flat top as flat
         return ()
     least = max(HIDDEN * span, LIMIT * noise)
-    found = []
+    items = []
     for upper, where in at.items():
         if where.sum() < FEWEST:
             continue
@@ -184,8 +184,8 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
         into = np.array([_jump(y, a) - REACHED * slope * _jump(voltage, a) for a, _ in runs])
         jumped = sum(b - a for (a, b), j in zip(runs, into, strict=True) if j > LIMIT * noise)
         if np.max(moved) > least and 2 * jumped < where.sum():
-            found.append(FlatEnd(float(y[where][0]), where, bool(upper)))
-    return tuple(found)
+            items.append(FlatEnd(float(y[where][0]), where, bool(upper)))
+    return tuple(items)
 
 
 def _jump(signal: FloatArray, at: int) -> float:
@@ -235,12 +235,12 @@ class Suspects:
     def notes(self, where: str) -> tuple[Note, ...]:
         """Return what was found in the column `where`, one note for each kind."""
         counts = {kind: n for kind, n in self.counts.items() if n and kind != "saturated"}
-        said = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
-        said += self.saturation(where)
+        items = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
+        items += self.saturation(where)
         if self.quantum is not None:
             step = (self.quantum, self.unit)
-            said.append(note("quantised", where=where, output=self.names[0], step=step))
-        return tuple(said)
+            items.append(note("quantised", where=where, output=self.names[0], step=step))
+        return tuple(items)
 
     def saturation(self, where: str) -> tuple[Note, ...]:
         """Return at which values the sensor was saturated, one note for each."""
@@ -273,14 +273,14 @@ def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Su
     and where more than half of the samples would be suspect, none is.
     """
     there = np.isfinite(output)
-    alike = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
-    drive = max(alike, key=lambda n: alike[n], default="")
+    table = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
+    drive = max(table, key=lambda n: table[n], default="")
     moving = inputs.get(drive, np.zeros(output.size))
     equal = bool(there.any()) and _is_noisy(output[there])
-    found = _suspects(output, moving, inputs, unit, equal=equal)
-    if 2 * found.mask.sum() > there.sum():
-        found = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
-    return replace(found, names=(name, drive, name))
+    result = _suspects(output, moving, inputs, unit, equal=equal)
+    if 2 * result.mask.sum() > there.sum():
+        result = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
+    return replace(result, names=(name, drive, name))
 
 
 def _correlation(u: FloatArray, y: FloatArray) -> float:
@@ -318,9 +318,9 @@ def _suspects(
     smallest = max(SMALLEST * span, 0.5 * LIMIT * (quantum or 0.0))
     outlying = spikes_in(known, table, LIMIT, smallest, SPIKE)[valid]
     kinds = (outlying, dropped, stuck, flat)
-    for kind, found in zip(counts, kinds, strict=True):
-        counts[kind] = int(found.sum())
-        mask[valid[found]] = True
+    for kind, result in zip(counts, kinds, strict=True):
+        counts[kind] = int(result.sum())
+        mask[valid[result]] = True
     return Suspects(mask, counts, quantum, unit, ends)
 
 
@@ -329,8 +329,8 @@ def cleaned(record: Record) -> Record:
     return masked(record, suspects(record))
 
 
-def masked(record: Record, found: Suspects) -> Record:
+def masked(record: Record, result: Suspects) -> Record:
     """Return the record with the samples that were found suspect masked (nan)."""
-    if record.displacement is None or not found.mask.any():
+    if record.displacement is None or not result.mask.any():
         return record
-    return replace(record, displacement=np.where(found.mask, np.nan, record.displacement))
+    return replace(record, displacement=np.where(result.mask, np.nan, record.displacement))

@@ -10,8 +10,8 @@ from typing import Any
 
 
 class _Report(ModuleType):
-    def __call__(self, *given: Any, **options: Any) -> None:
-        import_module("psa_casadi.report.shown").report(*given, **options)
+    def __call__(self, *inputs: Any, **options: Any) -> None:
+        import_module("psa_casadi.report.shown").report(*inputs, **options)
 
 
 sys.modules[__name__].__class__ = _Report

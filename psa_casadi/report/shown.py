@@ -109,7 +109,7 @@ def cell(result: Plotted | Model | Told) -> str:
     if isinstance(result, Signals):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
     words = line(result) if isinstance(result, Trajectory) else repr(result)
-    for kind, tell in _WORDS.items():
+    for kind, notify in _WORDS.items():
         if isinstance(result, kind):
-            words = tell(result)
+            words = notify(result)
     return filled("cell.html", told=words, name=line(result), picture=picture)

@@ -59,8 +59,8 @@ def compiler_command() -> list[str]:
     """
     wanted = os.environ.get("CC", "").strip()
     if not wanted:
-        found = None if platform.system() == "Windows" else shutil.which("cc")
-        return [found] if found and not _only_asks_for_tools(found) else zig_command()
+        result = None if platform.system() == "Windows" else shutil.which("cc")
+        return [result] if result and not _only_asks_for_tools(result) else zig_command()
     if shutil.which(wanted):  # a path with spaces
         return [wanted]
     try:
@@ -102,8 +102,8 @@ def vector_flags() -> tuple[str, ...]:
 
     numpy knows which of its own kernels run here.
     """
-    found = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
-    kernels = " ".join(str(k.get("current")) for f in found.values() for k in f.values())
+    result = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
+    kernels = " ".join(str(k.get("current")) for f in result.values() for k in f.values())
     wide = any(name in kernels for name in ("AVX2", "X86_V3", "AVX512", "X86_V4"))
     return ("-mavx2",) if wide else ()
 
@@ -114,8 +114,8 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
     What it makes for itself lies in the directory too, so that it goes with it. Raises OSError
     where the disk is full.
     """
-    own = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
-    environment = {**os.environ, **own, "LC_ALL": "C"}  # its messages in English
+    item = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
+    environment = {**os.environ, **item, "LC_ALL": "C"}  # its messages in English
     if "ziglang" in command:
         environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(writable_room("zig")))
         environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(directory))

@@ -27,16 +27,16 @@ def kernel_text(structure: Structure, output: str) -> str:
 
     Raises NotExact where the model is not for exact steps.
     """
-    given = {"exact_model.h": model_text(structure, (output,))}
+    table = {"exact_model.h": model_text(structure, (output,))}
     folder = sources_directory()
-    seen: set[str] = set()
+    texts: set[str] = set()
 
     def text(name: str) -> str:
-        if name in seen:
+        if name in texts:
             return ""
-        seen.add(name)
-        found = given.get(name) or (folder / name).read_text(encoding="utf-8")
-        return _INCLUDE.sub(lambda match: text(match[1]), found)
+        texts.add(name)
+        result = table.get(name) or (folder / name).read_text(encoding="utf-8")
+        return _INCLUDE.sub(lambda match: text(match[1]), result)
 
     return text("exact_kernel.cu")
 
@@ -137,29 +137,29 @@ def run_on_device(
     rooms: Any = None
     waiting: tuple[Any, Any] | None = None
     for which in (*parts(batch), None):
-        given = None if which is None else numbers(which)
+        inputs = None if which is None else numbers(which)
         with _failures():
-            found = None
+            result = None
             if waiting is not None:
-                summary, shown = waiting
+                summary, displayed = waiting
                 kept = Summary(*cupy.asnumpy(summary))
-                found = kept, cupy.asnumpy(shown).T if whole else None
-            if given is not None:
-                sets = given.p.shape[1]
+                result = kept, cupy.asnumpy(displayed).T if whole else None
+            if inputs is not None:
+                sets = inputs.p.shape[1]
                 if rooms is None:  # the first batch is the largest
                     rooms = cupy.empty(max(1, sets * room), np.int8)
                 waiting = cupy.empty((4, sets)), cupy.empty((n, sets)) if whole else np.intp(0)
                 arguments = (
                     np.int64(sets), np.int64(n), *record, np.int32(0), *steps,
-                    *(cupy.asarray(np.ascontiguousarray(a)) for a in given),
+                    *(cupy.asarray(np.ascontiguousarray(a)) for a in inputs),
                     np.float64(task.tolerance), np.int32(FINEST),
                     np.int64(min(MOST_IN_LANES * n, 2**31 - 1)), meant, rooms, np.int64(room),
                     *waiting,
                 )  # fmt: skip
                 launch = kernels.get_function("psa_exact_sets")
                 launch((-(-sets // _BLOCK),), (_BLOCK,), arguments)
-        if found is not None:
-            yield found
+        if result is not None:
+            yield result
 
 
 @contextmanager

@@ -133,18 +133,18 @@ def _rows(model: Model, sets: Sequence[Mapping[str, float]]) -> FloatArray:
 
 def _columns(model: Model, sets: Mapping[str, npt.ArrayLike]) -> FloatArray:
     """Return parameters (np, m) of one mapping of names to the values in all sets."""
-    given = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in sets.items()}
-    lengths = {len(v) for v in given.values() if v.ndim == 1}
-    if len(lengths) != 1 or any(v.ndim != 1 for v in given.values()):
-        told = ", ".join(f"{name} {v.shape}" for name, v in given.items()) or "none"
+    table = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in sets.items()}
+    lengths = {len(v) for v in table.values() if v.ndim == 1}
+    if len(lengths) != 1 or any(v.ndim != 1 for v in table.values()):
+        output = ", ".join(f"{name} {v.shape}" for name, v in table.items()) or "none"
         raise InputError(
             f"Every parameter needs one value for each set, in arrays of one length; there are:"
-            f" {told}. A parameter that all sets share belongs into the model (`with_values`)."
+            f" {output}. A parameter that all sets share belongs into the model (`with_values`)."
         )
-    model.with_values({name: model.values.get(name, 0.0) for name in given})  # raises
+    model.with_values({name: model.values.get(name, 0.0) for name in table})  # raises
     count = lengths.pop()
     return np.array([
-        given[name] if name in given else np.full(count, model.values[name])
+        table[name] if name in table else np.full(count, model.values[name])
         for name in model.parameter_names
     ])  # fmt: skip
 
@@ -156,8 +156,8 @@ def _numbers(model: Model, task: Task, p: FloatArray) -> Numbers:
     """
     nominals = [s.nominal for s in model.structure.states]
     unlike = list(dict.fromkeys(nominals))
-    given = (dict(zip(model.parameter_names, row, strict=True)) for row in p.T.tolist())
-    sizes = [[nominal_value(size, values) for size in unlike] for values in given]
+    inputs = (dict(zip(model.parameter_names, row, strict=True)) for row in p.T.tolist())
+    sizes = [[nominal_value(size, values) for size in unlike] for values in inputs]
     places = [unlike.index(size) for size in nominals]
     nominal = np.array(sizes).reshape(p.shape[1], len(unlike)).T[places]
     return Numbers(p, starts_on(model, p, nominal, task.t, task.u), nominal)
@@ -175,12 +175,12 @@ def _on_cores(model: Model, task: Task, p: FloatArray, reduce: _Reduce | None) -
         return []
 
     def lanes(which: range) -> list[FloatArray]:
-        own, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
-        found = run_sets(
-            task.structure, task.t, task.u, p=own, x0=x0, nominal=nominal,
+        item, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
+        values = run_sets(
+            task.structure, task.t, task.u, p=item, x0=x0, nominal=nominal,
             tolerance=task.tolerance, output=task.output,
         )  # fmt: skip
-        return kept(found.T, which)
+        return kept(values.T, which)
 
     def alone(which: range) -> list[FloatArray]:
         one = _alone(model, p[:, which.start])
@@ -205,16 +205,16 @@ def _on_device(
 ) -> FloatArray:
     """Run sets on a GPU, one a thread."""
     n = len(task.t)
-    found: list[FloatArray] = [np.empty((0, n))] if named is None and reduce is None else []
+    arrays: list[FloatArray] = [np.empty((0, n))] if named is None and reduce is None else []
     for summary, rows in run_on_device(
         task, partial(_parts, p.shape[1]),
         lambda which: _numbers(model, task, p[:, which.start : which.stop]), whole=named is None,
     ):  # fmt: skip
         if named is not None:
-            found.append(named.of_summary(summary, n))
+            arrays.append(named.of_summary(summary, n))
         elif rows is not None:
-            found.append(rows if reduce is None else np.array([reduce(row) for row in rows]))
-    return np.concatenate(found) if found else np.empty(0)
+            arrays.append(rows if reduce is None else np.array([reduce(row) for row in rows]))
+    return np.concatenate(arrays) if arrays else np.empty(0)
 
 
 def _parts(count: int, size: int) -> list[range]:

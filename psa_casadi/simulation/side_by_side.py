@@ -34,15 +34,15 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
     What has begun is finished first, what has not is left out. Context variables are the caller's.
     A keyboard interrupt ends the simulations of what has begun, too.
     """
-    given, count = list(items), threads()
-    if len(given) < 2 or count == 1:
-        return [work(item) for item in given]
-    with interruptible_work() as own, ThreadPoolExecutor(max_workers=count) as pool:
-        contexts = [copy_context() for _ in given]
+    inputs, count = list(items), threads()
+    if len(inputs) < 2 or count == 1:
+        return [work(item) for item in inputs]
+    with interruptible_work() as part, ThreadPoolExecutor(max_workers=count) as pool:
+        contexts = [copy_context() for _ in inputs]
         try:
-            return list(pool.map(lambda context, item: context.run(work, item), contexts, given))
+            return list(pool.map(lambda context, item: context.run(work, item), contexts, inputs))
         except KeyboardInterrupt:
-            own.stop()
+            part.stop()
             raise
 
 
@@ -108,7 +108,7 @@ def compiled(models: Iterable[Model]) -> None:
 
 
 def _compile(model: Model) -> None:
-    shown = output_of(model)
+    text = output_of(model)
     with suppress(PsaError, MachineError):
-        if why_not(model.structure, model.output_names if shown is None else (shown,)):
+        if why_not(model.structure, model.output_names if text is None else (text,)):
             make_ready(model)

@@ -91,11 +91,11 @@ def trace(
     """
     if not way.stepped:
         try:
-            found = run_exact(
+            exact_steps = run_exact(
                 model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
                 hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
             )  # fmt: skip
-            return Traced(found.shown, found.sensitivity, EXACT)
+            return Traced(exact_steps.shown, exact_steps.sensitivity, EXACT)
         except NotExact:
             pass
     steps = run(
@@ -118,20 +118,20 @@ def accurate(
     before: FloatArray | None = None
     for share, coarsest in LADDER if output and rtol >= TIGHTEST else ():
         try:
-            found = run_exact(
+            exact_steps = run_exact(
                 model, t, u, x0, tolerance=max(share * rtol, 1e-13), coarsest=coarsest, hold=hold,
                 outputs=(output,), everything=before is not None,
             )  # fmt: skip
         except NotExact:
             break
-        if before is not None and not found.forced:
+        if before is not None and not exact_steps.forced:
             nominal = model.output_nominals()[model.output_names.index(output)]
-            size = max(float(np.ptp(found.shown)), STILL * nominal)
-            if np.max(np.abs(found.shown - before)) <= AGREE * rtol * size:
+            size = max(float(np.ptp(exact_steps.shown)), STILL * nominal)
+            if np.max(np.abs(exact_steps.shown - before)) <= AGREE * rtol * size:
                 z = np.empty((len(t), 0))
-                cost = found.steps, found.rejected, 0
-                return Steps(found.x, z, found.y, found.sensitivity, *cost), EXACT
-        before = found.shown
+                cost = exact_steps.steps, exact_steps.rejected, 0
+                return Steps(exact_steps.x, z, exact_steps.y, exact_steps.sensitivity, *cost), EXACT
+        before = exact_steps.shown
     step_rtol = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
     return run(model, t, u, x0, rtol=step_rtol, hold=hold), STEPPER
 
@@ -197,9 +197,9 @@ def simulate(
     """
     t, v = np.asarray(time, dtype=float), np.asarray(voltage, dtype=float)
     more = {"load_force": load_force, "temperature": temperature}
-    given = {"voltage": v, **{n: np.asarray(q, float) for n, q in more.items() if q is not None}}
-    _check(model, t, given)
-    u = input_samples(model, len(t), given)
+    table = {"voltage": v, **{n: np.asarray(q, float) for n, q in more.items() if q is not None}}
+    _check(model, t, table)
+    u = input_samples(model, len(t), table)
     if as_exported is None:
         as_exported = memory is None and model.starts_itself
     if from_rest_at_zero:
@@ -222,10 +222,10 @@ def simulate(
     )
 
 
-def input_samples(model: Model, n: int, given: Mapping[str, FloatArray]) -> FloatArray:
+def input_samples(model: Model, n: int, values: Mapping[str, FloatArray]) -> FloatArray:
     """Return the samples (n, nu) of a model's inputs; those not given stay at their start value."""
     u = np.tile([i.start for i in model.structure.inputs], (n, 1))
-    for name, samples in given.items():
+    for name, samples in values.items():
         u[:, model.input_names.index(name)] = samples[:n]
     return u
 
@@ -236,11 +236,11 @@ def record_inputs(model: Model, record: Record, n: int) -> FloatArray:
     return input_samples(model, n, {k: v for k, v in columns.items() if v is not None})
 
 
-def _check(model: Model, t: FloatArray, given: Mapping[str, FloatArray]) -> None:
+def _check(model: Model, t: FloatArray, values: Mapping[str, FloatArray]) -> None:
     problems = Problems()
     if t.ndim != 1 or t.size < 2 or not np.all(np.diff(t) > 0):
         problems.add("The times do not strictly increase; give two or more, sorted, in seconds.")
-    for name, samples in given.items():
+    for name, samples in values.items():
         if name not in model.input_names:
             problems.add(
                 f"The model has no input '{name}', it has {quoted(model.input_names)}; use `run`"

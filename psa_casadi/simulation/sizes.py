@@ -59,18 +59,18 @@ def sizes_of(
     starts: Sequence[Mapping[str, float]] | None = None,
 ) -> Sizes:
     """Return the sizes of a model's signals in experiments. Raises PsaError."""
-    given = starts or [{} for _ in experiments]
-    pairs = zip(experiments, given, strict=True)
+    arguments = starts or [{} for _ in experiments]
+    pairs = zip(experiments, arguments, strict=True)
     courses = [_course(model, e, s, _LOOK_RTOL) for e, s in pairs]
     tables, outputs = [c.x for c in courses], [c.y for c in courses]
     inputs = [record_inputs(model, e.record, e.record.n) for e in experiments]
     f, p = _rates(model.structure), model.parameter_vector()
-    found = []
+    items = []
     for e, u, x in zip(experiments, inputs, tables, strict=True):
         time = e.record.time - e.record.time[0]
-        found.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
+        items.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
     rates, sums, changes = (
-        [np.array(part).T for part in parts] for parts in zip(*found, strict=True)
+        [np.array(part).T for part in parts] for parts in zip(*items, strict=True)
     )
 
     def largest(names: Sequence[str], parts: Sequence[FloatArray]) -> dict[str, float]:
@@ -101,11 +101,11 @@ def sized(model: Model, experiments: Sequence[Experiment]) -> Model:
     if not any(s.nominal == 1.0 for c in model.components for s in c.states):
         return model
     try:
-        found = sizes_of(model, experiments)
+        result = sizes_of(model, experiments)
     except PsaError:
         return model
     return model.with_components(
-        resized(c, tuple(found.signals[s.name] for s in c.states)) for c in model.components
+        resized(c, tuple(result.signals[s.name] for s in c.states)) for c in model.components
     )
 
 

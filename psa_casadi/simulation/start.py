@@ -72,9 +72,9 @@ def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, f
     """
     names = model.state_names
     if not is_stack(model):
-        found = _declared(model, u[0], deviations)
+        result = _declared(model, u[0], deviations)
         return Start(
-            found.x, found.by_parameter, found.by_start[:, [*map(names.index, deviations)]]
+            result.x, result.by_parameter, result.by_start[:, [*map(names.index, deviations)]]
         )
     memories = memory_names(model.structure)
     start = start_on(model, t, u, {n: deviations.get(n, 0.0) for n in memories})
@@ -126,9 +126,9 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
     if not np.isfinite(x).all():
         raise PsaError("The effects' states have no rest at the start; change the values.")
     others = [k for k in range(nx) if k not in resting]
-    own = np.linalg.pinv(slopes[:, resting])
-    by_p[resting] = -own @ by_parameter
-    by_x[np.ix_(resting, others)] = -own @ slopes[:, others]
+    item = np.linalg.pinv(slopes[:, resting])
+    by_p[resting] = -item @ by_parameter
+    by_x[np.ix_(resting, others)] = -item @ slopes[:, others]
     by_x[np.ix_(resting, resting)] = np.eye(len(resting))
     x[resting] += away[resting]
     return Start(x, by_p, by_x)
@@ -319,13 +319,13 @@ def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
     jacobian, by_input = _at(s, by_x, start), _at(s, by_u, start)
-    own = jacobian[fast, fast]
+    item = jacobian[fast, fast]
     for _ in range(2):
         drive = by_input[fast, :] @ rate
         if memory:
             drive += jacobian[fast, memory] @ _at(s, slopes, moving)[memory]
         # a steady motion lags behind the rest by the rates it takes
-        moving = _moved(start, fast, _solved(own, -_solved(own, drive)))
+        moving = _moved(start, fast, _solved(item, -_solved(item, drive)))
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
     results = [ca.densify(e) for e in (moving, *derivatives)]
     return settle, rest, ca.Function("moving", [*where, known, rate], results)
@@ -338,8 +338,8 @@ def _functions_of_many(
 ) -> tuple[ca.Function, ca.Function, ca.Function]:
     """Return the functions of `start_state` for so many columns, the last without derivatives."""
     settle, rest, moving = _start_functions(structure)
-    given = moving.sx_in()
-    start = ca.Function("start", given, [moving.call(given)[0]])
+    inputs = moving.sx_in()
+    start = ca.Function("start", inputs, [moving.call(inputs)[0]])
     return settle.map(sets), rest.map(sets), start.map(sets)
 
 

@@ -137,16 +137,16 @@ def run(
             values=values,
         )  # fmt: skip
         return found_so
-    own = values or model.values
+    item = values or model.values
     if z0 is None:
         z0 = np.array([q.start for q in s.sampled])
     if s0 is None:
         s0 = unit_columns(nx, unknowns)
-    asked = model.output_names if outputs is None else outputs
-    rows = [model.output_names.index(name) for name in asked]
+    requested = model.output_names if outputs is None else outputs
+    rows = [model.output_names.index(name) for name in requested]
     arrays: dict[str, npt.NDArray[Any]] = {
         "t": doubles(t), "u": doubles(u), "x0": doubles(x0), "z0": doubles(z0), "s0": doubles(s0),
-        "p": np.array([own[name] for name in model.parameter_names]),
+        "p": np.array([item[name] for name in model.parameter_names]),
         "nominal": model.state_nominals() if nx else np.ones(1), "x": np.empty((n, max(1, nx))),
         "z": np.empty((n, len(s.sampled))), "y": np.empty((n, len(s.outputs))),
         "which": which_of(model, unknowns), "outputs": np.array(rows, np.int32),
@@ -176,8 +176,8 @@ def run(
             f" {_REASONS[status]}. Parameter values far from physical ones are the likely cause;"
             " check them, or loosen the tolerance."
         )
-    found = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"]
-    return Steps(*found, request.steps, request.rejected, request.evaluations)
+    result = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"]
+    return Steps(*result, request.steps, request.rejected, request.evaluations)
 
 
 def doubles(values: npt.ArrayLike) -> FloatArray:

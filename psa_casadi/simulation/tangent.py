@@ -66,33 +66,33 @@ class Along:
         self.size = f.numel_out(0)
         self._steps: list[tuple[Any, Any, Any]] = []
         for k in range(f.n_instructions()):
-            op, given, kept = (
+            op, inputs, kept = (
                 f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
             )  # fmt: skip
             if op == ca.OP_CONST:
                 self._steps.append((None, f.instruction_constant(k), kept[0]))
             elif op == ca.OP_INPUT:
-                self._steps.append((op, given, kept[0]))
+                self._steps.append((op, inputs, kept[0]))
             elif op == ca.OP_OUTPUT:
-                self._steps.append((op, given[0], kept[1]))
+                self._steps.append((op, inputs[0], kept[1]))
             else:
-                self._steps.append((_OPERATIONS[op], given, kept[0]))
+                self._steps.append((_OPERATIONS[op], inputs, kept[0]))
 
     def __call__(self, n: int, *arguments: FloatArray) -> FloatArray:
         """Return the values (n, size); arguments (elements, n), or (elements,) where constant."""
         slots: dict[int, Any] = {}
-        found = np.empty((n, self.size))
+        values = np.empty((n, self.size))
         with np.errstate(all="ignore"):  # what is not finite is seen by whoever asked
-            for op, given, kept in self._steps:
+            for op, inputs, kept in self._steps:
                 if op is None:
-                    slots[kept] = given
+                    slots[kept] = inputs
                 elif op == ca.OP_INPUT:
-                    slots[kept] = arguments[given[0]][given[1]]
+                    slots[kept] = arguments[inputs[0]][inputs[1]]
                 elif op == ca.OP_OUTPUT:
-                    found[:, kept] = slots[given]
+                    values[:, kept] = slots[inputs]
                 else:
-                    slots[kept] = op(*(slots[a] for a in given))
-        return found
+                    slots[kept] = op(*(slots[a] for a in inputs))
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +130,11 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
         return None
     written = effect.equations(Symbols(s.symbols))
     balances, terms = tuple(written.add), ca.vertcat(ca.SX(0, 1), *written.add.values())
-    own = tuple(names.index(q.name) for q in effect.states)
-    others = [k for k in range(len(names)) if k not in own]
+    item = tuple(names.index(q.name) for q in effect.states)
+    others = [k for k in range(len(names)) if k not in item]
     moved = effect.linear or (effect.gain,)
     by = ca.vertcat(*(s.symbols[n] for n in moved))
-    z, rates = s.x[list(own), 0], s.xdot[list(own), 0]
+    z, rates = s.x[list(item), 0], s.xdot[list(item), 0]
     slopes = s.jacobian(rates, z)
     if written.switches or ca.depends_on(slopes, ca.vertcat(s.x, s.u, s.time)):
         return None
@@ -149,7 +149,7 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
     forward = not ca.depends_on(ca.vertcat(rates, added), s.x[behind])
     if not reached:
         balances, added, by_gain = (), s.y, s.jacobian(s.y, by)
-    rest = ca.substitute([rates], [z], [ca.SX.zeros(len(own))])[0]
+    rest = ca.substitute([rates], [z], [ca.SX.zeros(len(item))])[0]
     ramp = ca.SX.sym("ramp", s.u.shape[0])
     every, moves = ca.vertcat(s.time, s.x, s.u), ca.vertcat(1, s.xdot, ramp)
     functions = (slopes, rest, ca.jtimes(rest, every, moves), added, by_gain)
@@ -157,7 +157,7 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
         made = [Along([*s.arguments, ramp], e) for e in functions]
     except KeyError:
         return None
-    return Law(s, moved, own, balances, forward, *made)
+    return Law(s, moved, item, balances, forward, *made)
 
 
 def _stays_exact(structure: Structure, effect: Component, balances: tuple[str, ...]) -> bool:
@@ -209,11 +209,11 @@ def course_of(
     x0 = begun(model, t, u, start).x
     if not way.stepped:
         try:
-            found = run_exact(
+            exact_steps = run_exact(
                 model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
                 hold=hold, outputs=tuple(outputs), everything=True,
             )  # fmt: skip
-            return Course(t, u, found.x, hold)
+            return Course(t, u, exact_steps.x, hold)
         except NotExact:
             pass
     return Course(t, u, run(model, t, u, x0, rtol=way.step_rtol, hold=hold).x, hold)
@@ -267,17 +267,17 @@ def answer(
     x[others] = course.x.T
     begin = begun(effect, t, u, start) if law.own else None
     z0, p = begin.x[list(law.own)] if begin else np.zeros(0), effect.parameter_vector()
-    found = _terms(law, t, x, u.T, p, z0, finite=finite)
+    result = _terms(law, t, x, u.T, p, z0, finite=finite)
     if not law.balances:
         rows = [effect.output_names.index(name) for name in outputs]
-        return Answer(found[:, :, rows].transpose(0, 2, 1), 0.0)
-    missed = 0.25 * _size(0.5 * (found[:-2:2] + found[2::2]) - found[1:-1:2])
+        return Answer(result[:, :, rows].transpose(0, 2, 1), 0.0)
+    misfit = 0.25 * _size(0.5 * (result[:-2:2] + result[2::2]) - result[1:-1:2])
     if law.own:
         half = _terms(law, t[::2], x[:, ::2], u[::2].T, p, z0, finite=finite)
-        missed = max(missed, _size(found[::2] - half))
+        misfit = max(misfit, _size(result[::2] - half))
     places = [model.input_names.index(_INPUT + b) for b in law.balances]
     answers = []
-    for k, terms in enumerate(found.transpose(1, 0, 2)):
+    for k, terms in enumerate(result.transpose(1, 0, 2)):
         inputs = np.zeros((len(t), len(model.input_names)))
         inputs[:, : course.u.shape[1]] = course.u
         inputs[:, places] = terms
@@ -288,13 +288,13 @@ def answer(
         else:
             first = begun(run_with, t, inputs, start)
             x0, s0 = first.x, first.by_parameter[:, [model.parameter_names.index(_GAIN)]]
-        own = trace(
+        traced = trace(
             run_with, t, inputs, x0, way=way, outputs=outputs, hold=course.hold,
             unknowns=() if finite else (_GAIN,), s0=None if finite else s0,
         )  # fmt: skip
-        answers.append(own.y if finite else own.sensitivity[:, :, 0])
-    size = _size(found - np.mean(found, axis=0))
-    return Answer(np.stack(answers, axis=2), missed / max(size, 1e-300))
+        answers.append(traced.y if finite else traced.sensitivity[:, :, 0])
+    size = _size(result - np.mean(result, axis=0))
+    return Answer(np.stack(answers, axis=2), misfit / max(size, 1e-300))
 
 
 def _size(values: FloatArray) -> float:
@@ -341,8 +341,8 @@ def _followed(
     right = np.empty((n, m))
     right[0] = z0
     moved = np.abs(np.diff(rest, axis=0))
-    beside = np.pad(moved, ((1, 1), (0, 0)))
-    most = _STEEPEST * np.maximum(moved, np.maximum(beside[:-2], beside[2:]))
+    others = np.pad(moved, ((1, 1), (0, 0)))
+    most = _STEEPEST * np.maximum(moved, np.maximum(others[:-2], others[2:]))
     for k, h in enumerate(lengths):
         at = np.flatnonzero(which == k)
         begin, end, up, down = rest[at], rest[at + 1], h * turns[0][at], h * turns[1][at]
@@ -357,6 +357,6 @@ def _followed(
         for i in range(m):
             for j in range(m):
                 band[m + i - j, at * m + j] = -e[i, j]
-    found, _ = scipy.linalg.lapack.dtbtrs(band, right.reshape(-1, 1), uplo="L", diag="U")
-    states: FloatArray = found.reshape(n, m)
+    result, _ = scipy.linalg.lapack.dtbtrs(band, right.reshape(-1, 1), uplo="L", diag="U")
+    states: FloatArray = result.reshape(n, m)
     return states

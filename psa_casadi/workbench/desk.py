@@ -102,8 +102,8 @@ class Item:
 
     def state(self) -> dict[str, Any]:
         """Return what the page shows of it."""
-        told = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
-        return {**told, "held": self.held, "model": self.is_model, "seen": self.seen}
+        table = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
+        return {**table, "held": self.held, "model": self.is_model, "seen": self.seen}
 
 
 class Desk:
@@ -203,11 +203,11 @@ class Desk:
                 self._changed()
         self._look([key])
 
-    def set(self, given: dict[str, Any]) -> None:
+    def set(self, table: dict[str, Any]) -> None:
         """Change settings; the files are read again where that changes how."""
         with self._lock:
             self._idle()
-            old, self._settings = self._settings, self._settings.changed(given, self.effects)
+            old, self._settings = self._settings, self._settings.changed(table, self.effects)
             new = self._settings
             self._changed()
         if (old.columns, old.sample_time) != (new.columns, new.sample_time):
@@ -247,13 +247,13 @@ class Desk:
 
     def stop(self) -> None:
         """Let what runs end and keep what it has."""
-        for own in self.running():
-            own.stop()
+        for item in self.running():
+            item.stop()
 
     def close(self) -> None:
         """End what runs, at once."""
-        for own in self.running():
-            own.end()
+        for item in self.running():
+            item.end()
 
     def running(self) -> list[Run]:
         """Return what runs: nothing, or one command."""
@@ -262,21 +262,21 @@ class Desk:
 
     # What is told
 
-    def state(self, version: int, number: int, seen: int) -> dict[str, Any]:
+    def state(self, version: int, number: int, observed: int) -> dict[str, Any]:
         """Return what has changed for a tab that knows a version and so many events of a run."""
         with self._lock:
-            told: dict[str, Any] = {"version": self._version}
+            table: dict[str, Any] = {"version": self._version}
             if self._run is not None:
                 self._run.look()
-                new = self._run.events[seen if number == self._number else 0 :]
-                told["run"] = {**self._run.state(), "number": self._number, "events": new}
-            told["export"] = None if self._export is None else self._export.state()
+                new = self._run.events[observed if number == self._number else 0 :]
+                table["run"] = {**self._run.state(), "number": self._number, "events": new}
+            table["export"] = None if self._export is None else self._export.state()
             if version != self._version:
-                told["items"] = [i.state() for i in self._items.values()]
-                told["settings"] = vars(self._settings)
-                told["result"] = runs.found(self.folder)
-                told["files"] = runs.files_left(self.folder)
-            return told
+                table["items"] = [i.state() for i in self._items.values()]
+                table["settings"] = vars(self._settings)
+                table["result"] = runs.found(self.folder)
+                table["files"] = runs.files_left(self.folder)
+            return table
 
     def result(self, name: str) -> Path | None:
         """Return the place of a file that a run has left, None where there is none of this name."""
@@ -289,13 +289,13 @@ class Desk:
                 item, settings = self._items.get(key), self._settings
             if item is None or item.is_model:
                 continue
-            seen = preview(
+            table = preview(
                 self.folder, item.path, settings.columns or None, settings.seconds, self.subject,
                 held=item.held,
             )  # fmt: skip
             with self._lock:
                 if self._items.get(key) == item and settings == self._settings:
-                    self._items[key] = replace(item, seen=seen)
+                    self._items[key] = replace(item, seen=table)
                     self._changed()
 
     def _idle(self) -> None:

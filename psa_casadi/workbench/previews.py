@@ -48,12 +48,12 @@ def preview(
     out needs no voltage that changes. `subject` is the model whose record it is.
     """
     file = path.relative_to(folder).as_posix()
-    asked = {
+    requested = {
         "file": file, "columns": columns, "sample_time": sample_time, "held": held,
         "inputs": subject.inputs, "outputs": subject.outputs,
     }  # fmt: skip
     try:
-        with started_python(_MODULE, json.dumps(asked), directory=folder) as child:
+        with started_python(_MODULE, json.dumps(requested), directory=folder) as child:
             done = heard(child, limit=_LIMIT_S)
     except subprocess.TimeoutExpired:
         return _problem(f"{path.name}: reading it comes to no end; save it again.")
@@ -63,8 +63,8 @@ def preview(
         return _problem(
             f"{path.name}: the process that read it has ended; the file is damaged or too large."
         )
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    table: dict[str, Any] = json.loads(done.stdout)
+    return table
 
 
 def looked_at(
@@ -77,7 +77,7 @@ def looked_at(
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what `preview` returns of a file in this folder, read in this process."""
-    head, problems, told = None, [], None
+    head, problems, output = None, [], None
     names = (*inputs, *outputs)
     try:
         wanted = parse_columns(columns, names) if columns else {}
@@ -87,21 +87,21 @@ def looked_at(
             signals, *_ = read_signals(
                 file, inputs=inputs, outputs=outputs, columns=wanted, sample_time=sample_time
             )
-            told = _told_of_signals(signals, inputs)
+            output = _told_of_signals(signals, inputs)
         else:
             record, *_ = read_records(
                 [file], columns=wanted, sample_time=sample_time, need_excitation=not held
             )
-            told = _told(record)
+            output = _told(record)
     except InputError as error:
         problems = list(error.problems)
-    found = _problem(*problems)
+    table = _problem(*problems)
     if head is not None:
         guess = {name: [f.index, f.unit] for name, f in head.guess.items()}
-        found["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
-        found["head"]["guess"] = guess
-    found["record"] = told
-    return found
+        table["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
+        table["head"]["guess"] = guess
+    table["record"] = output
+    return table
 
 
 def _problem(*sentences: str) -> dict[str, Any]:
@@ -186,11 +186,11 @@ def _png(figure: Figure) -> str:
 def main() -> None:
     """Read what is asked for on the command line and write the answer to standard output."""
     end_with_parent()
-    asked = json.loads(sys.argv[1])
+    content = json.loads(sys.argv[1])
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # libraries may say something
-        found = looked_at(**asked)
-    json.dump(found, out, allow_nan=False)
+        table = looked_at(**content)
+    json.dump(table, out, allow_nan=False)
 
 
 if __name__ == "__main__":

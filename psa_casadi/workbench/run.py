@@ -49,11 +49,11 @@ class Settings:
     hysteresis: str = ""
     leave_out: tuple[str, ...] = ()
 
-    def changed(self, given: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
+    def changed(self, table: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
         """Return the settings with what is given; raises InputError for what cannot be."""
         texts = ("columns", "sample_time", "stiffness", "hysteresis")
-        new = {name: str(given[name]).strip()[:_LONGEST] for name in texts if name in given}
-        left_out = given.get("leave_out", self.leave_out)
+        new = {name: str(table[name]).strip()[:_LONGEST] for name in texts if name in table}
+        left_out = table.get("leave_out", self.leave_out)
         if not isinstance(left_out, list | tuple) or not set(left_out) <= set(effects):
             raise InputError("An effect to leave out is not known.")
         for name in ("sample_time", "stiffness"):
@@ -80,11 +80,11 @@ class Settings:
 
     def options(self) -> list[str]:
         """Return the options of the command."""
-        given = {
+        table = {
             "--columns": self.columns, "--sample-time": self.sample_time,
             "--stiffness": self.stiffness, "--hysteresis": self.hysteresis,
         }  # fmt: skip
-        named = [f"{option}={text}" for option, text in given.items() if text]
+        named = [f"{option}={text}" for option, text in table.items() if text]
         return [*named, *(f"--leave-out={name}" for name in self.leave_out)]
 
 
@@ -213,11 +213,11 @@ def diagnosis(
 def found(folder: Path) -> dict[str, Any] | None:
     """Return the main figures of the diagnosis that lies in a folder, None where none does."""
     try:
-        told = json.loads((folder / JSON).read_text(encoding="utf-8"))
+        content = json.loads((folder / JSON).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     names = ("verdict", "causes", "errors", "gain", "budget", "remaining", "notes")
-    return {name: told.get(name) for name in names}
+    return {name: content.get(name) for name in names}
 
 
 def files_left(folder: Path) -> dict[str, int]:

@@ -78,11 +78,11 @@ def page(effects: Sequence[str], subject: Subject) -> str:
     """Return the page; `effects` are those that a person may leave out of the search."""
     outputs = [subject.units[name] for name in subject.outputs]
     unit = "m" if not outputs else outputs[0] if len(outputs) == 1 else ""
-    told = {"effects": list(effects), "columns": subject.columns, "unit": unit}
+    table = {"effects": list(effects), "columns": subject.columns, "unit": unit}
     template = environment().from_string(_PAGE.joinpath("workbench.html").read_text("utf-8"))
-    asked = Markup(json.dumps(told).replace("<", "\\u003c"))
+    markup = Markup(json.dumps(table).replace("<", "\\u003c"))
     return template.render(
-        style=_STYLE, script=_SCRIPT, version=__version__, told=asked, stack=not outputs
+        style=_STYLE, script=_SCRIPT, version=__version__, told=markup, stack=not outputs
     )
 
 
@@ -192,18 +192,18 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _look_at_cookie(self, why: str) -> None:
         """Refuse what has not the cookie, or is caused by another site."""
-        found = None
+        result = None
         if self.headers.get("Sec-Fetch-Site", "none") in _OWN:
             with contextlib.suppress(CookieError):
-                found = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
-        if found is None or not _same(found.value, self.server.session):
+                result = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
+        if result is None or not _same(result.value, self.server.session):
             raise _RefusedError(HTTPStatus.FORBIDDEN, why)
 
     def _get(self) -> None:
         parts = urlsplit(self.path)
-        asked = {name: values[-1] for name, values in parse_qs(parts.query).items()}
+        table = {name: values[-1] for name, values in parse_qs(parts.query).items()}
         server = self.server
-        if parts.path == "/" and _same(asked.get("token", ""), server.token):
+        if parts.path == "/" and _same(table.get("token", ""), server.token):
             cookie = f"{server.cookie}={server.session}; HttpOnly; SameSite=Strict; Path=/"
             self._answer(_DOOR.encode(), _HTML, {"Set-Cookie": cookie, **_PAGE_POLICY})
             return
@@ -212,7 +212,7 @@ class _Handler(BaseHTTPRequestHandler):
             content = page(server.desk.effects, server.desk.subject)
             self._answer(content.encode(), _HTML, _PAGE_POLICY)
         elif parts.path == "/state":
-            known = (_whole(asked, name) for name in ("version", "run", "seen"))
+            known = (_whole(table, name) for name in ("version", "run", "seen"))
             self._answer(json.dumps(server.desk.state(*known)).encode(), _JSON)
         elif parts.path == "/report":
             self._send_file("report.html", _REPORT_POLICY)
@@ -240,15 +240,15 @@ class _Handler(BaseHTTPRequestHandler):
             desk.add(unquote(self.headers.get("X-Name", "")), self.rfile, size)
             self.close_connection = False
         else:
-            given: Any = None
+            content: Any = None
             with contextlib.suppress(ValueError, RecursionError):
-                given = json.loads(self.rfile.read(size) or b"{}")
-            if not isinstance(given, dict):
+                content = json.loads(self.rfile.read(size) or b"{}")
+            if not isinstance(content, dict):
                 raise InputError("The request is not understood.")
             acts: dict[str, Callable[[], None]] = {
-                "/remove": lambda: desk.remove(_whole(given, "key")),
-                "/hold": lambda: desk.hold(_whole(given, "key"), given.get("held") is True),
-                "/settings": lambda: desk.set(given),
+                "/remove": lambda: desk.remove(_whole(content, "key")),
+                "/hold": lambda: desk.hold(_whole(content, "key"), content.get("held") is True),
+                "/settings": lambda: desk.set(content),
                 "/start": desk.start,
                 "/stop": desk.stop,
                 "/export": desk.export,
@@ -292,6 +292,6 @@ def _same(one: str, other: str) -> bool:
     return hmac.compare_digest(one.encode(), other.encode())
 
 
-def _whole(given: Mapping[str, Any], name: str) -> int:
-    text = str(given.get(name, ""))
+def _whole(table: Mapping[str, Any], name: str) -> int:
+    text = str(table.get(name, ""))
     return int(text) if text.isascii() and text.isdecimal() and len(text) < 10 else 0

@@ -166,7 +166,7 @@ def lorenz() -> Plant:
             q[0] * q[1] - truth["b"] * q[2],
         ]  # fmt: skip
 
-    found = solve_ivp(rates, (0.0, t[-1]), [1.0, 1.0, 20.0], t_eval=t, rtol=1e-10, atol=1e-12).y
+    result = solve_ivp(rates, (0.0, t[-1]), [1.0, 1.0, 20.0], t_eval=t, rtol=1e-10, atol=1e-12).y
     x, y, z, *p = (ca.SX.sym(n) for n in ("x", "y", "z", "s", "r", "b"))
     model = psa.ode_model(
         {
@@ -177,7 +177,7 @@ def lorenz() -> Plant:
         outputs=["first", "last"],
         parameters=[_log("s", 7.0), _log("r", 20.0), _log("b", 2.0)],
     )  # fmt: skip
-    first, last = (found[k] + 0.3 * rng.standard_normal(t.size) for k in (0, 2))
+    first, last = (result[k] + 0.3 * rng.standard_normal(t.size) for k in (0, 2))
     return model, {"time": t, "first": first, "last": last}, truth
 
 

@@ -25,11 +25,11 @@ def _solved(
     method: Literal["LSODA", "RK45"] = "LSODA",
 ) -> FloatArray:
     """Return the states (nx, n) at the times."""
-    found = solve_ivp(
+    result = solve_ivp(
         rates, (0.0, t[-1]), start, t_eval=t, rtol=1e-8, atol=1e-10, max_step=most, method=method
     )
-    assert found.success
-    return np.asarray(found.y)
+    assert result.success
+    return np.asarray(result.y)
 
 
 def multisine(t: FloatArray, frequencies: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -97,9 +97,9 @@ def tanks(seed: int, hidden: str) -> Signals:
         return [0.0 if full else inflow - through, through - 0.028 * np.sqrt(lower)]
 
     level = _solved(rates, t, [0.3, 0.4], 0.5, "RK45")[1]  # it chatters at the brim
-    shown = level + 0.12 * level**2 if hidden == "sensor" else level
-    shown = shown + 0.002 * rng.standard_normal(len(t))
-    return Signals(name=hidden, time=t, columns={"pump": u, "level": shown})
+    displayed = level + 0.12 * level**2 if hidden == "sensor" else level
+    displayed = displayed + 0.002 * rng.standard_normal(len(t))
+    return Signals(name=hidden, time=t, columns={"pump": u, "level": displayed})
 
 
 def breathing(seed: int) -> Signals:
@@ -166,8 +166,8 @@ def _cylinder(seed: int, t: FloatArray, u: FloatArray, number: int) -> Signals:
 
     p, _, x = _solved(rates, t, [0.0, 0.0, 0.0], 0.005)
     true = {"position": x, "pressure": p}
-    shown = {n: y + 2e-3 * np.ptp(y) * rng.standard_normal(len(t)) for n, y in true.items()}
-    return Signals(name=f"cylinder_{number}", time=t, columns={"u": u, **shown})
+    table = {n: y + 2e-3 * np.ptp(y) * rng.standard_normal(len(t)) for n, y in true.items()}
+    return Signals(name=f"cylinder_{number}", time=t, columns={"u": u, **table})
 
 
 def oven(seed: int) -> Signals:

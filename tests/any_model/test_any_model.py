@@ -42,16 +42,16 @@ def _only(d: psa.Diagnosis, effect: str) -> bool:
 
 
 def test_a_clean_model_of_two_outputs_is_identified_with_its_errors(tmp_path: Path) -> None:
-    found = psa.identify(motor(), plants.motor(2, friction=0.0), starts=3)
+    result = psa.identify(motor(), plants.motor(2, friction=0.0), starts=3)
     true = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
     for name, value in true.items():
-        assert abs(found.model.values[name] - value) < 4.0 * found.errors[name]
-        assert found.errors[name] < 0.05 * value
-    assert found.rms["w"] == pytest.approx(0.3, rel=0.05)
-    assert found.rms["i"] == pytest.approx(0.005, rel=0.05)
-    assert not found.warnings
-    assert found.model.provenance.identified_from[0][0] == "drive"
-    found.report(tmp_path / "fit.html")
+        assert abs(result.model.values[name] - value) < 4.0 * result.errors[name]
+        assert result.errors[name] < 0.05 * value
+    assert result.rms["w"] == pytest.approx(0.3, rel=0.05)
+    assert result.rms["i"] == pytest.approx(0.005, rel=0.05)
+    assert not result.warnings
+    assert result.model.provenance.identified_from[0][0] == "drive"
+    result.report(tmp_path / "fit.html")
     page = Page((tmp_path / "fit.html").read_text("utf-8"))
     assert "w by 0.301 rad/s (1.0 times its noise) and i by 4.95 mA" in page.text
     assert "R 1.200 1.199 to 1.200 Ohm fit" in page.text
@@ -67,8 +67,8 @@ def test_pages_hold_every_output_of_every_record(tmp_path: Path) -> None:
         )
         for name, part in (("first", slice(None, 1500)), ("second", slice(1500, None)))
     ]  # fmt: skip
-    found = psa.identify(motor(), parts, starts=1)
-    found.report(tmp_path / "fit.html")
+    result = psa.identify(motor(), parts, starts=1)
+    result.report(tmp_path / "fit.html")
     page = Page((tmp_path / "fit.html").read_text("utf-8"))
     for name in ("w of first", "w of second", "i of first", "i of second"):
         assert name in page.text
@@ -170,8 +170,8 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert "position: error on held-out samples, rms base model 160 µm" in page.text
     assert f"extended model {rms:.2f} µm" in page.text
     rival = replace(d.causes[0], confidence=0.6, cannot_be_told_from=("stop_of_x",))
-    said = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
-    assert said in verdict_sentence(replace(d, causes=(rival,)))
+    statement = "(the rate of v, confidence 60 %: more likely than not; or stop of x)"
+    assert statement in verdict_sentence(replace(d, causes=(rival,)))
     assert re.search(r"hysteresis_of_x_in_v_n 0\.99\d+ 0\.99\d+ to 1\.0\d+ 1 fit", page.text)
     assert page.loaded == []
     assert page.targets <= page.names
@@ -181,9 +181,9 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
     assert np.max(np.abs(numbers(below["y"]))) == pytest.approx(np.max(np.abs(miss)), rel=1e-5)
     assert len(numbers(above["y"])) == len(numbers(below["y"])) > 1000
     assert path.stat().st_size < 3_000_000
-    told = psa.story(d, width=300).splitlines()
-    assert told[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
-    (error,) = (line for line in told if line.startswith("error"))
+    output = psa.story(d, width=300).splitlines()
+    assert output[0].startswith("verdict    cause named. The cause is hysteresis of x in v")
+    (error,) = (line for line in output if line.startswith("error"))
     assert f"position: held-out rms 160 µm of the base, {rms:.2f} µm of the e" in error
     linear = psa.run(
         d.model.with_values({"hysteresis_of_x_in_v_size": 0.0}), run.record.time,
@@ -191,16 +191,16 @@ def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
         np.zeros(len(d.model.state_names)), hold="linear",
     ).y[:, 0]  # fmt: skip
     size = f"it moves the position by up to {1e3 * np.ptp(d.extended[0][:, 0] - linear):.3g} mm"
-    assert size in told[1]
+    assert size in output[1]
     assert size in page.text
     assert "Against it: approach from the same side" in page.text
     document = valid("own_model", d.to_json())
     assert document["causes"][0]["port"] == "the rate of v"
     low, high = document["budget"]["causes"][0]["interval"]
     assert 0.9 < low < d.explained_share < high
-    own = [f"{100 * x:.2f}" for x in (d.explained_share, low, 1.0)]
-    shown = f"hysteresis of x in v {own[0]} % {own[1]} to {own[2]} %"
-    assert shown in page.text  # cut, as no share is above 100 %
+    items = [f"{100 * x:.2f}" for x in (d.explained_share, low, 1.0)]
+    displayed = f"hysteresis of x in v {items[0]} % {items[1]} to {items[2]} %"
+    assert displayed in page.text  # cut, as no share is above 100 %
     assert find_browser(tmp_path).serious_faults(path, DARK) == []
 
 
@@ -275,8 +275,8 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     for f in names["posterior"].figures:
         true = {"k": 0.05, "J": 3e-5, "b": 2e-5}[f.name]
         assert abs(f.mean - true) < 4.0 * f.sd < 0.1 * true
-    told = Page((tmp_path / "two_motors.html").read_text("utf-8")).text
-    assert "Beyond noise, J differs (3 parameters compared)." in told
+    output = Page((tmp_path / "two_motors.html").read_text("utf-8")).text
+    assert "Beyond noise, J differs (3 parameters compared)." in output
     assert {(o.device, o.parameter) for o in names["motors"].outliers} == {("4", "J")}
     assert (tmp_path / "motors.html").stat().st_size > 10_000
 
@@ -293,9 +293,9 @@ def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
     free = d.correction
     assert free is not None
     assert f"{free.share:.0%}" in d.unnamed
-    told = d.budget.unnamed
-    assert told is not None
-    assert told.interval[0] < told.share == free.share < told.interval[1]
+    output = d.budget.unnamed
+    assert output is not None
+    assert output.interval[0] < output.share == free.share < output.interval[1]
     x = d.experiments[0].measured(0)  # the state that it follows is what was measured
     assert free.variable == "x"
     assert len(free.along) == len(free.added) == len(x)
@@ -309,7 +309,7 @@ def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
     x0 = np.zeros(len(patched.state_names))
     u = record_inputs(patched, run.record, run.record.n)
     y = psa.run(patched, run.record.time, u, x0, hold="linear").y[:, 0]
-    with_it, base = (np.std((x - shown)[run.held_out]) for shown in (y, d.base[0][:, 0]))
+    with_it, base = (np.std((x - displayed)[run.held_out]) for displayed in (y, d.base[0][:, 0]))
     assert with_it < 0.8 * base
 
 
@@ -317,16 +317,16 @@ def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
     ("word", "effects"), [("screening", []), ("judging", ["friction_in_speed"])]
 )
 def test_an_interrupt_keeps_the_best_model_so_far(word: str, effects: list[str]) -> None:
-    def stop(told: str) -> None:
-        if told.startswith(word):
+    def stop(text: str) -> None:
+        if text.startswith(word):
             raise KeyboardInterrupt
 
     with pytest.raises(DiagnosisInterrupted) as ended:
         psa.diagnose(motor(), plants.motor(1), starts=1, progress=stop)
-    found = ended.value.model
-    assert [c.name for c in found.effects] == effects
-    assert found.provenance.interrupted
-    assert found.values["R"] == pytest.approx(1.2, rel=0.05)
+    result = ended.value.model
+    assert [c.name for c in result.effects] == effects
+    assert result.provenance.interrupted
+    assert result.values["R"] == pytest.approx(1.2, rel=0.05)
 
 
 @pytest.mark.slow
@@ -340,11 +340,11 @@ def test_ports_and_effects_of_gain_0_leave_a_model_as_it_is(make: Callable[[], p
     t, u = runs[0].record.time, record_inputs(model, runs[0].record, runs[0].record.n)
     x0 = np.array([s.start for s in model.structure.states])
     plain = psa.run(model, t, u, x0, rtol=1e-8)
-    beside = np.array([s.start for s in every.structure.states])
+    others = np.array([s.start for s in every.structure.states])
     assert psa.run(opened, t, u, x0, rtol=1e-8).y == pytest.approx(plain.y, abs=1e-12)
-    shown = psa.run(every, t, u, beside, rtol=1e-8).y
+    displayed = psa.run(every, t, u, others, rtol=1e-8).y
     size = np.ptp(plain.y) + np.max(np.abs(plain.y))
-    assert np.max(np.abs(shown - plain.y)) < 1e-4 * size  # steps of other lengths
+    assert np.max(np.abs(displayed - plain.y)) < 1e-4 * size  # steps of other lengths
 
 
 def _quiet(model: psa.Model) -> Signals:
@@ -363,19 +363,19 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
     )  # fmt: skip
     ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
     text = (ROOT / "docs/howto/own_model.md").read_text("utf-8")
-    shown = []
+    items = []
     for effect in effects_of(model, Sizes(ones, ones, sample=1.0, duration=1.0)):
         kind, c = re.split("_of_|_in_", effect.name)[0], effect.component
-        if kind not in shown:
-            shown.append(kind)
+        if kind not in items:
+            items.append(kind)
             fitted = [p for p in c.parameters if p.fitted]
-            said = "; ".join(
+            statement = "; ".join(
                 f"`{p.name.removeprefix(f'{c.name}_')}` {p.description}" for p in fitted
             )
             law = re.sub(r"\|(\w+)\|", r"abs(\1)", c.equation_text)
             what = c.description.removeprefix(f"{effect.port.words}: ")
-            assert f"\n| `{c.name}` | {what} | `{law}` | {said} |\n" in text
-    assert len(shown) == text.count("\n| `") == 15
+            assert f"\n| `{c.name}` | {what} | `{law}` | {statement} |\n" in text
+    assert len(items) == text.count("\n| `") == 15
 
 
 def test_the_help_of_both_faces_tells_of_own_models() -> None:
@@ -390,11 +390,11 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
     alone = {"position": t}
     with pytest.raises(psa.InputError, match=r"lack the input 'force'.*Name the column so"):
         psa.identify(oscillator(), replace(quiet, columns={"position": quiet.time}))
-    for given in ({"time": t, **alone}, {"time [s]": t, **alone, "Forces": t}):
+    for inputs in ({"time": t, **alone}, {"time [s]": t, **alone, "Forces": t}):
         with pytest.raises(
             psa.InputError, match=r"the column 'force' is missing \(found: time, pos"
         ):
-            psa.identify(oscillator(), given)
+            psa.identify(oscillator(), inputs)
     with pytest.raises(psa.InputError, match=r"no output of the model 'oscillator'"):
         psa.diagnose(oscillator(), {"time": t, "force": t})
     with pytest.raises(psa.InputError, match=r"model comes first.*psa.diagnose\(model, records\)"):

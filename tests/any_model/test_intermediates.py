@@ -97,6 +97,6 @@ def test_a_rate_that_is_an_input_or_a_flow() -> None:
     model = psa.ode_model(
         {"x": [x, y], "u": u, "w": flow, "wdef": u * x - y, "ode": [u, flow]}, name="filled"
     )
-    found = ports_of(model)
-    assert [p.variable for p in found if p.kind == "rate"] == ["y"]
-    assert ports_of(with_ports(model)) == found
+    ports = ports_of(model)
+    assert [p.variable for p in ports if p.kind == "rate"] == ["y"]
+    assert ports_of(with_ports(model)) == ports

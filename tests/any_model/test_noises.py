@@ -45,20 +45,20 @@ def force(rng: Generator) -> FloatArray:
 
 def moved(force: FloatArray, friction: float = 0.0) -> FloatArray:
     def rates(t: float, x: FloatArray) -> list[float]:
-        own = friction * np.tanh(x[1] / 0.005)
-        return [x[1], np.interp(t, TIME, force) - STIFFNESS * x[0] - DAMPING * x[1] - own]
+        item = friction * np.tanh(x[1] / 0.005)
+        return [x[1], np.interp(t, TIME, force) - STIFFNESS * x[0] - DAMPING * x[1] - item]
 
     span = TIME[0], TIME[-1]
-    found = solve_ivp(rates, span, [0.0, 0.0], t_eval=TIME, max_step=0.04, rtol=1e-8, atol=1e-10)
-    return np.asarray(found.y[0])
+    result = solve_ivp(rates, span, [0.0, 0.0], t_eval=TIME, max_step=0.04, rtol=1e-8, atol=1e-10)
+    return np.asarray(result.y[0])
 
 
 def followed(rng: Generator, correlation: float) -> FloatArray:
     """Noise of first order with variance 1."""
-    found, new = np.zeros(TIME.size), rng.standard_normal(TIME.size)
+    values, new = np.zeros(TIME.size), rng.standard_normal(TIME.size)
     for k in range(1, TIME.size):
-        found[k] = correlation * found[k - 1] + np.sqrt(1.0 - correlation**2) * new[k]
-    return found
+        values[k] = correlation * values[k - 1] + np.sqrt(1.0 - correlation**2) * new[k]
+    return values
 
 
 def record(force: FloatArray, y: FloatArray, rng: Generator) -> dict[str, FloatArray]:
@@ -81,9 +81,9 @@ def test_coloured_noise_of_a_sensor_is_noise(correlation: float) -> None:
 
 
 def test_an_output_that_no_state_reaches_may_have_noise_of_a_colour() -> None:
-    x, given, gain = (ca.SX.sym(n) for n in ("x", "u", "gain"))
+    x, inputs, gain = (ca.SX.sym(n) for n in ("x", "u", "gain"))
     model = psa.ode_model(
-        {"x": x, "u": given, "p": gain, "ode": given - x, "y": gain * given},
+        {"x": x, "u": inputs, "p": gain, "ode": inputs - x, "y": gain * inputs},
         name="follower", inputs=["u"], outputs=["y"],
         parameters=[psa.Parameter("gain", 1.0, "1", (0.1, 10.0), "gain", log=True)],
     )  # fmt: skip
@@ -109,11 +109,11 @@ def test_a_random_load_is_told_with_its_place_and_size(seed: int) -> None:
     u = force(rng)
     d = psa.diagnose(mass(), record(u, moved(u + 0.1 * followed(rng, 0.99)), rng))
     assert d.verdict == "adequate"
-    (told,) = entering(d)
-    assert told.values["place"] in ("force", "v")
-    assert 0.03 < told.values["rms"][0] < 0.3
-    assert told.values["time"] > 0.2
-    assert "is likelier" in str(told)
+    (output,) = entering(d)
+    assert output.values["place"] in ("force", "v")
+    assert 0.03 < output.values["rms"][0] < 0.3
+    assert output.values["time"] > 0.2
+    assert "is likelier" in str(output)
 
 
 @pytest.mark.slow
@@ -143,8 +143,8 @@ def test_friction_is_named_beside_outliers_of_one_output() -> None:
     y = moved(u, 0.3)
     speed = np.gradient(y, TIME)
     y = y + np.where(rng.random(y.size) < 0.01, np.std(y) * rng.standard_normal(y.size), 0.0)
-    own = record(u, y, rng)
-    own["speed"] = speed + 0.02 * np.std(speed) * rng.standard_normal(y.size)
-    d = psa.diagnose(mass(speed=True), own)
+    item = record(u, y, rng)
+    item["speed"] = speed + 0.02 * np.std(speed) * rng.standard_normal(y.size)
+    d = psa.diagnose(mass(speed=True), item)
     assert "friction_in_v" in [c.effect for c in d.causes]
     assert any("spikes" in str(n) for n in d.remarks)

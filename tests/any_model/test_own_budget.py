@@ -71,12 +71,12 @@ def _covered(shares: Sequence[Share], truth: float) -> int:
 @pytest.mark.parametrize("records", [1, 7])  # blocks of one, and six that are held out whole
 def test_intervals_cover_the_known_shares(records: int) -> None:
     rng = np.random.default_rng(29)
-    found = [_shares(rng, records) for _ in range(DRAWS)]
+    items = [_shares(rng, records) for _ in range(DRAWS)]
     low, high = binom.interval(0.999, DRAWS, 0.95)
     for shares, truth in (
-        ([f.first for f in found], SHARE),
-        ([f.other for f in found], 1.0 - SHARE),
-        ([f.together for f in found], 1.0),
+        ([f.first for f in items], SHARE),
+        ([f.other for f in items], 1.0 - SHARE),
+        ([f.together for f in items], 1.0),
     ):
         centres = np.array([s.share for s in shares])
         assert np.mean(centres) == pytest.approx(truth, abs=4.0 * np.std(centres) / DRAWS**0.5)

@@ -137,9 +137,9 @@ def test_a_file_is_read_in_the_units_of_the_model(
 def test_tables_and_signals_are_read_in_the_units_of_the_model() -> None:
     _assert_is_the_record(COLUMNS)
     _assert_is_the_record(pd.DataFrame(COLUMNS))
-    shown = {"valve": VALVE, "flow": 6e4 * FLOW, "Speed": SPEED, "oil_temp": WARM - 273.15}
+    table = {"valve": VALVE, "flow": 6e4 * FLOW, "Speed": SPEED, "oil_temp": WARM - 273.15}
     units = {"flow": "l/min", "oil_temp": "degC"}
-    signals = psa.Signals(name="run", time=T, columns=shown, units=units)
+    signals = psa.Signals(name="run", time=T, columns=table, units=units)
     _assert_is_the_record(signals)
     _assert_is_the_record(signals.to_frame())
     assert signals.plot(output="flow").axes[0].get_ylabel() == "flow [l/min]"
@@ -148,19 +148,19 @@ def test_tables_and_signals_are_read_in_the_units_of_the_model() -> None:
 
 def test_the_same_record_in_other_units_is_the_same_identification(tmp_path: Path) -> None:
     record = plants.bouc_wen(1)
-    given = {
+    table = {
         "t [ms]": 1e3 * record.time[:500],
         "Force [kN]": 1e-3 * record.columns["force"][:500],
         "position [mm]": 1e3 * record.columns["position"][:500],
     }
     path = tmp_path / "drive.csv"
     np.savetxt(
-        path, np.column_stack([*given.values()]), "%.17g", ";", header=";".join(given), comments=""
+        path, np.column_stack([*table.values()]), "%.17g", ";", header=";".join(table), comments=""
     )
     columns = {n: v[:500] for n, v in record.columns.items()}
     plain = psa.Signals(name="drive", time=record.time[:500], columns=columns)
     expected = psa.identify(oscillator(), plain, starts=1).model.values
-    for one in (given, path):
+    for one in (table, path):
         assert psa.identify(oscillator(), one, starts=1).model.values == pytest.approx(expected)
 
 
@@ -180,8 +180,8 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
     assert (run.record.hold, run.record.sha256) == ("zero", record.sha256)
     columns = {"voltage": VALVE, "displacement": SPEED}
     units = {"voltage": "V", "displacement": "um"}
-    told = psa.Signals(name="s", time=T, columns=columns, units=units)
-    (again,) = records_given(told)
+    signals = psa.Signals(name="s", time=T, columns=columns, units=units)
+    (again,) = records_given(signals)
     np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
 
 
@@ -210,28 +210,28 @@ def test_what_cannot_be_meant_is_refused_with_what_to_type(
     change: tuple[str, str], said: str
 ) -> None:
     before, after = change
-    given = {after if name == before else name: values for name, values in COLUMNS.items()}
-    assert re.search(said, _refused(given), re.DOTALL)
+    table = {after if name == before else name: values for name, values in COLUMNS.items()}
+    assert re.search(said, _refused(table), re.DOTALL)
 
 
 def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("time [s],valve,flow,speed\n" + "0,1,2,x\n" * 20)
-    said = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
-    assert "bad.csv: line 2, column 'Speed': found 'x', expected a number" in said
-    assert "none.csv: there is no such file" in said
-    assert "int is no record; give the path of a file, a data frame" in said
-    assert "record 4: column names: the column 'flow' is missing (found: time, valve)" in said
-    said = _refused({"time": T, "valve": VALVE, "flow": FLOW})
-    assert "no output of the model 'pump' with eight samples or more; the model's are" in said
+    statement = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
+    assert "bad.csv: line 2, column 'Speed': found 'x', expected a number" in statement
+    assert "none.csv: there is no such file" in statement
+    assert "int is no record; give the path of a file, a data frame" in statement
+    assert "record 4: column names: the column 'flow' is missing (found: time, valve)" in statement
+    statement = _refused({"time": T, "valve": VALVE, "flow": FLOW})
+    assert "no output of the model 'pump' with eight samples or more; the model's are" in statement
 
 
 def test_a_unit_that_is_not_stated_is_told() -> None:
-    found = psa.identify(motor(), plants.motor(2, friction=0.0), starts=1)
-    assert not found.warnings
+    result = psa.identify(motor(), plants.motor(2, friction=0.0), starts=1)
+    assert not result.warnings
     record = plants.motor(2, friction=0.0)
-    found = psa.identify(motor(), {"time": record.time, **record.columns}, starts=1)
-    assert found.warnings == ("record states no unit of w and i; the model's are taken.",)
+    result = psa.identify(motor(), {"time": record.time, **record.columns}, starts=1)
+    assert result.warnings == ("record states no unit of w and i; the model's are taken.",)
 
 
 def test_a_column_that_is_like_a_missing_output_is_named(tmp_path: Path) -> None:
@@ -242,10 +242,10 @@ def test_a_column_that_is_like_a_missing_output_is_named(tmp_path: Path) -> None
     by_hand = psa.Signals(
         name="hand", time=T, columns={"valve": VALVE, "flow": FLOW, "Speed": SPEED, "ol_temp": WARM}
     )
-    for given in (columns, file, by_hand):
-        said = " ".join(map(str, told_of_columns(_pump(), [_run(given)])))
-        assert "No record has a column 'oil_temp'; that output is not compared." in said
-        assert "The records have 'ol_temp'; name the column 'oil_temp' if it is that." in said
+    for inputs in (columns, file, by_hand):
+        text = " ".join(map(str, told_of_columns(_pump(), [_run(inputs)])))
+        assert "No record has a column 'oil_temp'; that output is not compared." in text
+        assert "The records have 'ol_temp'; name the column 'oil_temp' if it is that." in text
 
 
 def test_columns_are_named_where_the_header_does_not(tmp_path: Path) -> None:
@@ -253,8 +253,8 @@ def test_columns_are_named_where_the_header_does_not(tmp_path: Path) -> None:
     rows = np.column_stack([T, VALVE, FLOW, SPEED])
     np.savetxt(path, rows, "%.17g", ",", header="a,b,c,CH 4", comments="")
     read = partial(psa.read_signals, inputs=("valve", "flow"), outputs=("Speed", "oil_temp"))
-    said = "time=a:s,valve=b:1,flow=3:m3/s,speed=CH 4:2rpm"
-    (signals,) = read(path, columns=said)
+    text = "time=a:s,valve=b:1,flow=3:m3/s,speed=CH 4:2rpm"
+    (signals,) = read(path, columns=text)
     assert (signals.units["flow"], signals.units["Speed"]) == ("m3/s", "rpm")
     np.testing.assert_allclose(signals.columns["Speed"], 2.0 * SPEED, rtol=1e-12)
     (again,) = read([path], columns="valve=b,flow=c,Speed=CH 4", sample_time=0.1)
@@ -281,9 +281,9 @@ def test_one_reading_in_a_hundred_that_is_far_off_is_masked_in_its_output_alone(
     model = cylinder(dead_zone=0.6)
     (clean,) = experiments_of(model, [record], judged=False)
     assert np.isfinite(_columns(clean, model.output_names)).all()
-    given = _spoilt(record, ("pressure",), 1)
-    (run,) = experiments_of(model, given_to(model, given, None), judged=False)
-    off = given["pressure"] != record.columns["pressure"]
+    table = _spoilt(record, ("pressure",), 1)
+    (run,) = experiments_of(model, given_to(model, table, None), judged=False)
+    off = table["pressure"] != record.columns["pressure"]
     lost = np.isnan(_columns(run, model.output_names))
     assert not lost[:, 0].any()
     assert not (lost[:, 1] & ~off).any()
@@ -291,8 +291,8 @@ def test_one_reading_in_a_hundred_that_is_far_off_is_masked_in_its_output_alone(
 
 
 def test_a_clean_record_with_outliers_is_adequate() -> None:
-    given = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
-    d = psa.diagnose(motor(), given, leave_out=["hysteresis", "stop", "curve", "delay"])
+    table = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
+    d = psa.diagnose(motor(), table, leave_out=["hysteresis", "stop", "curve", "delay"])
     assert d.verdict == "adequate"
     assert not d.causes
     assert all(e.base < 1.1 * e.noise for e in d.errors)
@@ -303,10 +303,10 @@ def test_a_clean_record_with_outliers_is_adequate() -> None:
 
 
 def test_identification_and_diagnosis_tell_the_same_noise() -> None:
-    given = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
-    fitted = psa.identify(motor(), given, starts=1)
-    found = psa.diagnose(motor(), given, leave_out=["hysteresis", "stop", "curve", "delay"])
-    for result in (fitted, found):
+    table = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
+    fitted = psa.identify(motor(), table, starts=1)
+    matches = psa.diagnose(motor(), table, leave_out=["hysteresis", "stop", "curve", "delay"])
+    for result in (fitted, matches):
         assert [(n.record, n.output) for n in result.noise_kinds] == [
             ("record", "w"),
             ("record", "i"),
@@ -316,9 +316,9 @@ def test_identification_and_diagnosis_tell_the_same_noise() -> None:
             assert n.kinds[1].figures == {"count": 30.0}
         file = json.loads(result.to_json())
         assert [n["kinds"][1]["kind"] for n in file["noise_kinds"]] == ["outliers"] * 2
-    said = [n for n in fitted.sentences if "outliers (at " in n]
-    assert said == [n for n in found.notes if "outliers (at " in n]
-    assert said[0].startswith("w in record has 30 outliers (at ")
+    items = [n for n in fitted.sentences if "outliers (at " in n]
+    assert items == [n for n in matches.notes if "outliers (at " in n]
+    assert items[0].startswith("w in record has 30 outliers (at ")
 
 
 def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
@@ -326,21 +326,21 @@ def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
     y = np.array(record.columns["w"])
     y[700:760] = y[700]
     top = float(np.quantile(y, 0.9))
-    given = {"time": record.time, **record.columns, "w": np.minimum(y, top)}
-    (run,) = experiments_of(motor(), given_to(motor(), given, None), judged=False)
+    table = {"time": record.time, **record.columns, "w": np.minimum(y, top)}
+    (run,) = experiments_of(motor(), given_to(motor(), table, None), judged=False)
     lost = np.isnan(_columns(run, motor().output_names)[:, 0])
     assert np.mean(lost[y >= top]) > 0.99
     assert lost[701:760].all()
     assert np.isfinite(_columns(run, motor().output_names)[:, 1]).all()
-    told = psa.identify(motor(), given, starts=1).warnings
-    assert any("while voltage moves w: the sensor is saturated there" in n for n in told)
-    assert any("w of record: 59 samples repeat the last one to the last digit" in n for n in told)
+    output = psa.identify(motor(), table, starts=1).warnings
+    assert any("while voltage moves w: the sensor is saturated there" in n for n in output)
+    assert any("w of record: 59 samples repeat the last one to the last digit" in n for n in output)
 
 
 def test_what_moves_in_jumps_without_noise_is_no_sensor_that_fails() -> None:
     """A valve that is open or not, and a mass at rest while its drive moves."""
     u = np.sin(2.0 * np.pi * 2.0 * T * 5.0)
     rest = np.maximum(u, 0.3)
-    given = {"time": T, "valve": u, "flow": u, "speed": 1.0 * (u > 0.2), "oil_temp": rest}
-    run = _run(given)
+    table = {"time": T, "valve": u, "flow": u, "speed": 1.0 * (u > 0.2), "oil_temp": rest}
+    run = _run(table)
     assert np.isfinite(_columns(run, _pump().output_names)).all()

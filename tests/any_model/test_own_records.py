@@ -33,8 +33,8 @@ def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_told(
     assert not d.remaining.white
     assert "but the held-out ones of" in d.remaining.where
     lines = replace(held, hold="linear")
-    told = psa.identify(oven(), lines, known_start=True)
-    assert any("'heater' stands still between jumps in oven, and" in w for w in told.warnings)
+    output = psa.identify(oven(), lines, known_start=True)
+    assert any("'heater' stands still between jumps in oven, and" in w for w in output.warnings)
     again = psa.identify(oven(), lines, known_start=True, hold="zero")
     assert not any("stands still" in w for w in again.warnings)
     assert again.model.values == psa.identify(oven(), held, known_start=True).model.values
@@ -69,9 +69,9 @@ def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
 def test_columns_in_another_unit_are_told() -> None:
     record = plants.motor(2, friction=0.0)
     columns = {"voltage": record.columns["voltage"], "w": 9.55e3 * record.columns["w"]}
-    found = psa.identify(motor(), {"time": record.time, **columns}, starts=1)
-    assert any("of its own movement: see that its column" in w for w in found.warnings)
-    assert "No record has a column 'i'; that output is not compared." in found.warnings
+    result = psa.identify(motor(), {"time": record.time, **columns}, starts=1)
+    assert any("of its own movement: see that its column" in w for w in result.warnings)
+    assert "No record has a column 'i'; that output is not compared." in result.warnings
 
 
 def test_what_an_input_did_in_a_gap_is_not_guessed() -> None:
@@ -79,12 +79,12 @@ def test_what_an_input_did_in_a_gap_is_not_guessed() -> None:
     kept = np.r_[0:1200, 1500:3000]
     columns = {n: values[kept] for n, values in whole.columns.items()}
     record = replace(whole, time=whole.time[kept], columns=columns, sha256="")
-    found = psa.identify(motor(), record, starts=1)
-    assert [e.record.name for e in found.experiments] == ["drive[0:1200]", "drive[1200:2700]"]
+    result = psa.identify(motor(), record, starts=1)
+    assert [e.record.name for e in result.experiments] == ["drive[0:1200]", "drive[1200:2700]"]
     assert any(
-        "no sample for 0.301 s from 1.199 s on, while the voltage" in w for w in found.warnings
+        "no sample for 0.301 s from 1.199 s on, while the voltage" in w for w in result.warnings
     )
     for name, value in {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}.items():
-        assert abs(found.model.values[name] - value) < 4.0 * found.errors[name]
+        assert abs(result.model.values[name] - value) < 4.0 * result.errors[name]
     held = psa.identify(motor(), replace(record, hold="zero"), starts=1)
     assert len(held.experiments) == 1

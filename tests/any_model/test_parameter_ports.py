@@ -29,8 +29,8 @@ def test_a_resistance_over_the_charge_is_named_at_its_parameter() -> None:
     values = d.model.values
     at = np.array([0.0, 0.5]) / values["change_of_R0_with_soc_range"]
     size, angle = (values[f"change_of_R0_with_soc_{k}"] for k in ("size", "angle"))
-    found = values["R0"] * (1.0 + size * (np.cos(angle) * at + np.sin(angle) * at**2))
-    np.testing.assert_allclose(found, [0.05 * 2.2, 0.05 * 1.3], rtol=0.05)
+    result = values["R0"] * (1.0 + size * (np.cos(angle) * at + np.sin(angle) * at**2))
+    np.testing.assert_allclose(result, [0.05 * 2.2, 0.05 * 1.3], rtol=0.05)
 
 
 def test_an_effect_of_ones_own_acts_at_a_parameter_and_is_kept(tmp_path: object) -> None:

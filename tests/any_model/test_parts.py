@@ -27,20 +27,20 @@ def _codes(notes: Any) -> set[str]:
 
 def test_parts_find_the_parameters_of_an_unstable_plant_and_that_its_input_is_held() -> None:
     model, record, truth = hard.pendulum()
-    found = psa.identify(model, record)
-    _near(found.model.values, truth)
-    assert found.rms["shown"] == pytest.approx(0.002, rel=0.05)
-    assert {"in_parts", "hold_found"} <= _codes(found.notes)
-    assert len(found.experiments) > 4
-    assert all(e.record.hold == "zero" for e in found.experiments)
+    result = psa.identify(model, record)
+    _near(result.model.values, truth)
+    assert result.rms["shown"] == pytest.approx(0.002, rel=0.05)
+    assert {"in_parts", "hold_found"} <= _codes(result.notes)
+    assert len(result.experiments) > 4
+    assert all(e.record.hold == "zero" for e in result.experiments)
 
 
 def test_parts_find_the_parameters_of_chaos() -> None:
     model, record, truth = hard.duffing()
-    found = psa.identify(model, record)
-    _near(found.model.values, truth, rel=0.02)
-    assert found.rms["x"] == pytest.approx(0.02, rel=0.05)
-    assert "hold_found" not in _codes(found.notes)
+    result = psa.identify(model, record)
+    _near(result.model.values, truth, rel=0.02)
+    assert result.rms["x"] == pytest.approx(0.02, rel=0.05)
+    assert "hold_found" not in _codes(result.notes)
 
 
 @pytest.mark.slow
@@ -48,10 +48,10 @@ def test_parts_find_the_parameters_of_chaos() -> None:
 def test_parts_are_as_short_as_a_plant_needs(plant: Callable[[], hard.Plant]) -> None:
     """Chaos with a hidden state; a rate that is not finite at 0, which no exact steps can have."""
     model, record, truth = plant()
-    found = psa.identify(model, record)
-    _near(found.model.values, truth, rel=0.01)
-    assert all(found.rms[n] == pytest.approx(found.noise[n], rel=0.05) for n in found.rms)
-    assert "in_parts" in _codes(found.notes)
+    result = psa.identify(model, record)
+    _near(result.model.values, truth, rel=0.01)
+    assert all(result.rms[n] == pytest.approx(result.noise[n], rel=0.05) for n in result.rms)
+    assert "in_parts" in _codes(result.notes)
 
 
 def test_parts_are_fitted_where_no_whole_record_can_be_simulated() -> None:

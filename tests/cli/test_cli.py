@@ -63,8 +63,8 @@ def test_the_page_goes_on_from_the_demo_whose_stack_is_what_its_record_gives(
     assert shlex.split(block.commands[0]) == ["psa", "demo"]
     assert run_block(block, tmp_path) is None
     record = read_record(tmp_path / "psa_demo" / "synthetic_record.csv")
-    found = load_model(tmp_path / "psa_demo" / "model.json")
-    rms = fit(found, [whole(record)], [], sigma=[1e-3 * record.range_m]).rms
+    model = load_model(tmp_path / "psa_demo" / "model.json")
+    rms = fit(model, [whole(record)], [], sigma=[1e-3 * record.range_m]).rms
     same_as_the_named_stack(rms, record, "demo")
 
 
@@ -94,11 +94,11 @@ def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(identify, "identify", lambda *_, **__: identification())
     monkeypatch.chdir(tmp_path)
     record = write(tmp_path / "a.csv", HEADER, *ROWS)
-    shown = command("identify", record, "--stack", "P-885.51")
-    assert shown.code == 0, shown.words
-    assert "95 % interval" in shown.out
-    assert "written" not in shown.out
-    assert max(map(len, shown.out.splitlines())) <= 80
+    displayed = command("identify", record, "--stack", "P-885.51")
+    assert displayed.code == 0, displayed.words
+    assert "95 % interval" in displayed.out
+    assert "written" not in displayed.out
+    assert max(map(len, displayed.out.splitlines())) <= 80
     assert [p.name for p in tmp_path.iterdir()] == ["a.csv"]
 
 
@@ -181,26 +181,26 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    found = Clock()
-    monkeypatch.setattr(steps, "clock", found)
-    return found
+    result = Clock()
+    monkeypatch.setattr(steps, "clock", result)
+    return result
 
 
 def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
-    told = Told("diagnosing", DIAGNOSE)
-    assert told.line() == "diagnosing, 0 s (most take up to 40 s)"
+    output = Told("diagnosing", DIAGNOSE)
+    assert output.line() == "diagnosing, 0 s (most take up to 40 s)"
     clock.now = 7.4
-    told.tell("screening effects")
+    output.tell("screening effects")
     step = "diagnosing, step 3 of 6 (screening the effects)"
-    assert told.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
+    assert output.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
     clock.now = 130.0
-    told.tell("base fit from zero")  # parts of the work come again; the step does not go back
-    assert told.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
-    assert told.line(drawn=False) == told.line()
+    output.tell("base fit from zero")  # parts of the work come again; the step does not go back
+    assert output.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
+    assert output.line(drawn=False) == output.line()
     console = Console(width=200)
-    with console.capture() as shown:
-        console.print(told)
-    assert shown.get().strip() == told.line()
+    with console.capture() as displayed:
+        console.print(output)
+    assert displayed.get().strip() == output.line()
 
 
 def test_lines_that_stay_tell_once_what_is_usual(
@@ -226,37 +226,37 @@ def test_lines_that_stay_tell_once_what_is_usual(
 )
 def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> None:
     texts = [p.read_text("utf-8") for r in rooms for p in SOURCE.glob(r)]
-    found = {m for t in texts for m in re.findall(r'progress\(f?"([^"{]{3,})', t)}
-    assert len(found) > 5
-    unknown = {told for told in found if not course.step_of(told)}
+    result = {m for t in texts for m in re.findall(r'progress\(f?"([^"{]{3,})', t)}
+    assert len(result) > 5
+    unknown = {output for output in result if not course.step_of(output)}
     assert not unknown
 
 
-def commands(own: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+def commands(item: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Yield a command of click, which some versions of typer hold in a room of their own."""
-    yield path, own
-    for name, inner in getattr(own, "commands", {}).items():
+    yield path, item
+    for name, inner in getattr(item, "commands", {}).items():
         yield from commands(inner, *path, name)
 
 
 EVERY = dict(commands(typer.main.get_command(app)))
 
 
-def written(own: Any) -> list[str]:
+def written(item: Any) -> list[str]:
     """Return the texts of a command's help, with single spaces."""
-    shown = (p for p in own.params if not getattr(p, "hidden", False))
-    texts = [own.help, own.epilog, *(getattr(p, "help", None) for p in shown)]
+    displayed = (p for p in item.params if not getattr(p, "hidden", False))
+    texts = [item.help, item.epilog, *(getattr(p, "help", None) for p in displayed)]
     return [" ".join(text.replace("\b", "").split()) for text in texts if text]
 
 
 @pytest.mark.parametrize("path", EVERY, ids=" ".join)
 def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> None:
-    shown = CliRunner().invoke(app, [*path, "--help"], env={"COLUMNS": "80"}).output
-    joined = " ".join(shown.split())
-    assert "\\" not in shown
+    displayed = CliRunner().invoke(app, [*path, "--help"], env={"COLUMNS": "80"}).output
+    joined = " ".join(displayed.split())
+    assert "\\" not in displayed
     assert [text for text in written(EVERY[path]) if text not in joined] == []
     assert [p.name for p in EVERY[path].params if not getattr(p, "help", "")] == []
-    lines = [line.strip() for line in shown.splitlines()]
+    lines = [line.strip() for line in displayed.splitlines()]
     if not hasattr(EVERY[path], "commands"):
         (example,) = (line for line in lines if line.startswith("Example: "))
         assert example.startswith(f"Example: psa {' '.join(path)} ")
@@ -283,12 +283,12 @@ def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> 
     ],
 )
 def test_a_shell_completes_the_names_that_there_are(line: str, names: Any) -> None:
-    asked = {"_PSA_COMPLETE": "complete_bash", "COMP_WORDS": line}
-    shown = subprocess.run(
+    table = {"_PSA_COMPLETE": "complete_bash", "COMP_WORDS": line}
+    displayed = subprocess.run(
         [sys.executable, "-m", "psa_casadi.cli"],
-        env=os.environ | asked | {"COMP_CWORD": str(len(line.split(" ")) - 1)},
+        env=os.environ | table | {"COMP_CWORD": str(len(line.split(" ")) - 1)},
         capture_output=True,
         text=True,
         check=True,
     )
-    assert set(shown.stdout.split()) == set(names)
+    assert set(displayed.stdout.split()) == set(names)

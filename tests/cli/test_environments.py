@@ -59,11 +59,11 @@ SLOW_STREAMS = ("output closed", "output on a full disk")
     [pytest.param(c, marks=[pytest.mark.slow] if c in SLOW_STREAMS else []) for c in STREAMS],
 )
 def test_output_that_cannot_be_written(case: str) -> None:
-    line, code, said = STREAMS[case]
+    line, code, statement = STREAMS[case]
     done = shell(line)
     assert done.returncode == code, done.stderr
-    assert done.stderr.startswith(said)
-    assert len(done.stderr.splitlines()) == bool(said), done.stderr
+    assert done.stderr.startswith(statement)
+    assert len(done.stderr.splitlines()) == bool(statement), done.stderr
 
 
 @posix
@@ -125,11 +125,11 @@ REFUSED: dict[str, tuple[BaseException, str]] = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_the_machine_refuses_is_no_fault_of_the_package(case: str) -> None:
-    error, said = REFUSED[case]
+    error, statement = REFUSED[case]
     code, output = ended_by(error)
     assert code == 1
     assert output.startswith("Failed: ")
-    assert said in output
+    assert statement in output
     assert "fault" not in output
 
 
@@ -162,8 +162,8 @@ def test_a_working_folder_that_was_removed_is_said(
     gone.mkdir()
     monkeypatch.chdir(gone)
     gone.rmdir()
-    told = refused("simulate", "--stack", "demo", "--input", "v.csv", "-o", "out.csv")
-    assert "The folder that this runs in is not there any more; change to another" in told
+    output = refused("simulate", "--stack", "demo", "--input", "v.csv", "-o", "out.csv")
+    assert "The folder that this runs in is not there any more; change to another" in output
 
 
 @pytest.fixture

@@ -126,11 +126,11 @@ def test_the_base_fit_is_not_swallowed(record: psa.Record) -> None:
     ("word", "search"), [("to the end", True), ("what further records", False)]
 )
 def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Record) -> None:
-    found = identify([record], progress=at(word))
-    assert found.interrupted
-    assert found.fit.interrupted == found.model.provenance.interrupted == search
-    assert not found.advice
-    assert found.fit.rms < 0.1 * record.range_m
+    result = identify([record], progress=at(word))
+    assert result.interrupted
+    assert result.fit.interrupted == result.model.provenance.interrupted == search
+    assert not result.advice
+    assert result.fit.rms < 0.1 * record.range_m
 
 
 @pytest.mark.parametrize(
@@ -185,8 +185,8 @@ def test_a_designed_voltage_is_kept_without_its_check(
     path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
     psa.write_record(tmp_path / "path.csv", path)
     voltage = tmp_path / "v.csv"
-    given = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
-    ended = command(*given, "--target", tmp_path / "path.csv")
+    items = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
+    ended = command(*items, "--target", tmp_path / "path.csv")
     assert ended.code == 130
     assert f"the voltage was designed before. Kept: {voltage}." in ended.err
     assert voltage.exists()
@@ -198,8 +198,8 @@ def test_files_that_stand_are_named_however_late_the_interrupt(
     monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "tell_written", cut)
     psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
-    given = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
-    ended = command(*given)
+    items = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
+    ended = command(*items)
     assert ended.code == 130
     assert f"Interrupted: written before: {out}." in ended.err
 
@@ -209,9 +209,9 @@ def test_files_that_stand_are_named_however_late_the_interrupt(
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     record, model, page = (tmp_path / n for n in ("r.csv", "m.json", "r.html"))
     make_record("slow_creep", 3, record)
-    given: list[str | Path] = [sys.executable, "-m", "psa_casadi.cli", "diagnose", record]
+    inputs: list[str | Path] = [sys.executable, "-m", "psa_casadi.cli", "diagnose", record]
     process = subprocess.Popen(
-        [*given, "-o", model, "--report", page, "--still"],
+        [*inputs, "-o", model, "--report", page, "--still"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip

@@ -36,8 +36,8 @@ def test_commands_run_in_an_empty_directory_that_the_next_block_may_share() -> N
 
 def test_what_pages_show_as_text_is_no_command() -> None:
     for page in pages():
-        shown = re.findall(r"^```(?:text)?\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
-        assert not re.search(r"^(\$ |psa |python |pip |import )", "\n".join(shown), re.M), page
+        displayed = re.findall(r"^```(?:text)?\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+        assert not re.search(r"^(\$ |psa |python |pip |import )", "\n".join(displayed), re.M), page
 
 
 def spans() -> list[tuple[str, str]]:
@@ -69,11 +69,11 @@ def wrong_word(command: Any, words: list[str]) -> str:
 
 def test_every_command_within_a_line_has_the_words_that_it_takes() -> None:
     group = get_command(app)
-    found = spans()
-    assert len(found) > 100
+    result = spans()
+    assert len(result) > 100
     wrong = {
         (place, span): word
-        for place, span in found
+        for place, span in result
         if (word := wrong_word(group, re.sub(r"[][]|\.\.\.|\{[^}]*\}", "X", span).split()[1:]))
     }
     assert wrong == {}
@@ -132,8 +132,8 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
 def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
     lines = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if line.startswith(f"| {place} | `"))
-    own = [e.name for e in EFFECTS.values() if e.belongs_to == place]
-    assert re.findall(r"`(\w+)`", row) == own
+    items = [e.name for e in EFFECTS.values() if e.belongs_to == place]
+    assert re.findall(r"`(\w+)`", row) == items
 
 
 #: Links of Markdown and HTML; badges lead to pages of the repository's host.

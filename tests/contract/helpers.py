@@ -118,7 +118,7 @@ def reference_run(
     time = np.linspace(0.0, stop, samples)
     swing = np.cos(4.0 * np.pi * time / stop) * (1.0 - 0.3 * time / stop)
     voltage = 0.4 * values["u_rated"] * (1.0 - swing)
-    found = reference.simulate(
+    result = reference.simulate(
         values, reference.from_samples(time, voltage), time, breakpoints=list(time)
     )
-    return time, voltage, found
+    return time, voltage, result

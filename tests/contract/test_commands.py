@@ -32,10 +32,10 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example_and_can_be_quiet(name: str) -> None:
     for option in ("--help", "-h"):
-        said = done(*name.split(), option).words
-        assert f"Usage: psa {name}" in said
-        assert f"Example: psa {name}" in said
-        assert "--quiet" in said
+        statement = done(*name.split(), option).words
+        assert f"Usage: psa {name}" in statement
+        assert f"Example: psa {name}" in statement
+        assert "--quiet" in statement
     assert name.split(maxsplit=1)[0] in done("--help").out.split()
 
 
@@ -53,8 +53,10 @@ def test_every_public_name_is_there_and_a_wrong_one_is_told() -> None:
 
 def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
     code = "import sys, psa_casadi; print([m for m in ('casadi', 'numpy') if m in sys.modules])"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert said.stdout == "[]\n"
+    statement = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert statement.stdout == "[]\n"
 
 
 @pytest.mark.parametrize(
@@ -113,9 +115,9 @@ def test_what_cannot_be_used_is_told_with_exit_code_2(
         "folder": tmp_path, "out": tmp_path / "out", "bytes": tmp_path / "bytes",
         "absent": tmp_path / "absent.csv", "demo": DATA / "demo.csv", "good": tmp_path / "good",
     }  # fmt: skip
-    told = refused(*(w.format(**places) for w in words), folder=tmp_path)
-    assert said in told
-    assert "Errno" not in told
+    output = refused(*(w.format(**places) for w in words), folder=tmp_path)
+    assert said in output
+    assert "Errno" not in output
 
 
 def test_a_message_is_one_sentence_on_stderr_of_a_process_of_its_own(tmp_path: Path) -> None:
@@ -141,21 +143,21 @@ def test_the_machines_fault_ends_with_1_and_leaves_files_as_they_were(
     out.write_bytes(b"kept")
     monkeypatch.setenv("CC", str(tmp_path / "no_compiler"))
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path.with_name("empty_cache")))
-    said = refused(
+    statement = refused(
         "export", "fmu", "--model", tmp_path / "m.json", "-o", out, code=1, folder=tmp_path
     )
-    assert "Failed: The C compiler" in said
-    assert str(tmp_path / "no_compiler") in said
+    assert "Failed: The C compiler" in statement
+    assert str(tmp_path / "no_compiler") in statement
     assert out.read_bytes() == b"kept"
     with pytest.raises(psa.MachineError, match="no_compiler"):
         psa.export_fmu(model, out)
 
 
 def test_mistakes_in_python_are_input_errors_that_list_all() -> None:
-    with pytest.raises(psa.InputError) as told:
+    with pytest.raises(psa.InputError) as output:
         psa.identify(["none.csv", {"t": [0.0]}])
-    assert {p.split(":")[0] for p in told.value.problems} == {"none.csv", "record 2"}
-    assert isinstance(told.value, psa.PsaError)
+    assert {p.split(":")[0] for p in output.value.problems} == {"none.csv", "record 2"}
+    assert isinstance(output.value, psa.PsaError)
     assert not issubclass(psa.MachineError, psa.PsaError)
     with pytest.raises(psa.InputError, match="no parameter 'kL'"):
         psa.stack_model("demo").with_values({"kL": 1.0})
@@ -177,10 +179,10 @@ def test_a_command_that_is_ended_says_so_and_leaves_no_half_file(
     assert running.stderr is not None
     assert running.stderr.readline()  # it works by now
     running.send_signal(number)
-    _, said = running.communicate(timeout=60)
+    _, statement = running.communicate(timeout=60)
     assert running.returncode == 128 + number
-    assert "Traceback" not in said
-    assert number != signal.SIGINT or "Interrupted: " in said
+    assert "Traceback" not in statement
+    assert number != signal.SIGINT or "Interrupted: " in statement
     assert list(tmp_path.iterdir()) == []
 
 
@@ -195,10 +197,10 @@ def test_examples_are_listed_shown_and_copied(tmp_path: Path) -> None:
 
 
 def test_an_effect_is_drawn_as_a_picture(tmp_path: Path) -> None:
-    for ending, begins in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
+    for ending, starts in (("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")):
         path = tmp_path / f"f.{ending}"
         done("effects", "sensor_delay", "--figure", path, "--quiet")
-        assert path.read_bytes().startswith(begins)
+        assert path.read_bytes().startswith(starts)
     words = refused("effects", "sensor_delay", "--figure", tmp_path / "f.txt", folder=tmp_path)
     assert "f.txt: --figure writes a picture, .png or .svg or .pdf; name it so." in words
     words = refused("batch", tmp_path, "-o", tmp_path / "out", "--report", tmp_path / "f.pdf")
@@ -225,11 +227,11 @@ def served(folder: Path) -> Iterator[tuple[str, str]]:
     assert running.stdout is not None
     try:
         for line in running.stdout:
-            found = re.search(r"http://(127\.0\.0\.1:\d+)/\?token=(\S+)", line)
-            if found:
+            result = re.search(r"http://(127\.0\.0\.1:\d+)/\?token=(\S+)", line)
+            if result:
                 break
-        assert found, "no address was told"
-        yield found[1], found[2]
+        assert result, "no address was told"
+        yield result[1], result[2]
     finally:
         running.send_signal(signal.SIGINT)
         running.wait(timeout=30)
@@ -266,18 +268,18 @@ def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: 
         assert token.encode() not in page
         cookie, origin = headers["set-cookie"].split(";")[0], f"http://{place}"
         record = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k) for k in range(99))
-        given = {"Cookie": cookie, "X_Name": quote("mine & <b>.csv")}
-        assert asked(place, "POST", "/files", record, Origin="http://x.example", **given)[0] == 403
-        assert asked(place, "POST", "/files", record, Origin=origin, **given)[0] < 300
-        begun, state = time.monotonic(), {}
-        while time.monotonic() < begun + 30.0:
+        table = {"Cookie": cookie, "X_Name": quote("mine & <b>.csv")}
+        assert asked(place, "POST", "/files", record, Origin="http://x.example", **table)[0] == 403
+        assert asked(place, "POST", "/files", record, Origin=origin, **table)[0] < 300
+        started, state = time.monotonic(), {}
+        while time.monotonic() < started + 30.0:
             state = json.loads(asked(place, "GET", "/state", Cookie=cookie)[2])
             if "voltage" in json.dumps(state):
                 break
             time.sleep(0.1)
-        told = json.dumps(state)
-        assert "mine & <b>.csv" in told
-        assert '"ms"' in told
+        text = json.dumps(state)
+        assert "mine & <b>.csv" in text
+        assert '"ms"' in text
     assert list(tmp_path.iterdir()) == []
 
 
@@ -341,9 +343,9 @@ def _oven(folder: Path) -> tuple[Path, Path]:
     for k in range(power.size):  # exact for a held power
         warmth[k] = x
         x = 2.0 * power[k] + (x - 2.0 * power[k]) * np.exp(-step / 5.0)
-    shown = warmth + 2e-3 * warmth**2 + 0.05 * rng.standard_normal(power.size)
+    displayed = warmth + 2e-3 * warmth**2 + 0.05 * rng.standard_normal(power.size)
     time = np.arange(power.size, dtype=np.float64) * step / 60.0
-    write(record, {"Time [min]": time, "heater [kW]": 1e-3 * power, "Warmth [mK]": 1e3 * shown})
+    write(record, {"Time [min]": time, "heater [kW]": 1e-3 * power, "Warmth [mK]": 1e3 * displayed})
     return model, record
 
 
@@ -351,38 +353,40 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
     tmp_path: Path,
 ) -> None:
     model, record = _oven(tmp_path)
-    asked = ("--model", f"{model}:make", "--hold", "zero", "--known-start")
-    fit, page, told = (tmp_path / n for n in ("fit.html", "page.html", "told.json"))
+    requested = ("--model", f"{model}:make", "--hold", "zero", "--known-start")
+    fit, page, output = (tmp_path / n for n in ("fit.html", "page.html", "told.json"))
     values, both = tmp_path / "values.json", tmp_path / "both.html"
-    said = done("identify", record, *asked, "--report", fit, "--json", values).out
-    assert "identified 'oven'" in said
-    assert "'warmth' is missed by" in said
+    statement = done("identify", record, *requested, "--report", fit, "--json", values).out
+    assert "identified 'oven'" in statement
+    assert "'warmth' is missed by" in statement
     assert "oven" in fit.read_text("utf-8")
     kept = tmp_path / "extended.json"
     left_out = ("--leave-out", "delay", "--leave-out", "satur")
-    words = ("--report", page, "--json", told, *left_out, "-o", kept)
-    said = done("diagnose", record, *asked, *words, "--expect", "cause_named").out
-    assert "cause named" in said
+    words = ("--report", page, "--json", output, *left_out, "-o", kept)
+    statement = done("diagnose", record, *requested, *words, "--expect", "cause_named").out
+    assert "cause named" in statement
     export = f"psa export fmu --model {kept} -o {kept.with_suffix('.fmu')}"
     assert export in page.read_text("utf-8")
-    said = done(*export.split()[1:]).out
-    assert "evidence: none; models of one's own carry none" in said
-    found = json.loads(told.read_text("utf-8"))
-    assert [cause["effect"] for cause in found["causes"]] == ["bend_of_warmth"]
-    assert found["values"]["T"] == pytest.approx(5.0, rel=0.01)
+    statement = done(*export.split()[1:]).out
+    assert "evidence: none; models of one's own carry none" in statement
+    content = json.loads(output.read_text("utf-8"))
+    assert [cause["effect"] for cause in content["causes"]] == ["bend_of_warmth"]
+    assert content["values"]["T"] == pytest.approx(5.0, rel=0.01)
     (row,) = json.loads(values.read_text("utf-8"))["records"]
     assert (row["output"], row["unit"], row["samples"]) == ("warmth", "K", 1200)
-    done("compare", values, told, "-o", both)
+    done("compare", values, output, "-o", both)
     assert "values" in both.read_text("utf-8")
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "one.csv").write_bytes(record.read_bytes())
-    said = done("batch", tmp_path / "records", "-o", tmp_path / "out", *asked, "--workers", "1").out
-    assert "1 devices: 1 done." in said
+    statement = done(
+        "batch", tmp_path / "records", "-o", tmp_path / "out", *requested, "--workers", "1"
+    ).out
+    assert "1 devices: 1 done." in statement
     one = json.loads((tmp_path / "out" / "one" / "identification.json").read_text("utf-8"))
     assert one["parameters"] == json.loads(values.read_text("utf-8"))["parameters"]
-    assert dict(psa.load_model(kept).values) == found["values"]
+    assert dict(psa.load_model(kept).values) == content["values"]
     assert page.read_text("utf-8").startswith("<!DOCTYPE html>")
-    ended = command("diagnose", record, *asked, *words, "--expect", "adequate")
+    ended = command("diagnose", record, *requested, *words, "--expect", "adequate")
     assert ended.code == 1
     assert "The verdict is cause_named; expected adequate." in ended.words
 
@@ -394,28 +398,36 @@ def test_effects_of_ones_own_are_searched_in_a_model_of_ones_own(
     monkeypatch.chdir(tmp_path)
     model, record = _oven(tmp_path)
     Path("scale.py").write_text(_SCALE, encoding="utf-8")
-    asked = ("--model", f"{model}:make", "--hold", "zero", "--known-start", "--effects", "scale")
-    told = tmp_path / "told.json"
-    done("diagnose", record, *asked, "--leave-out", "bend", "--json", told)
-    found = json.loads(told.read_text("utf-8"))
-    assert [cause["effect"] for cause in found["causes"]] == ["bent_scale"]
-    said = refused("diagnose", record, "--effects", "scale")
-    assert "no symbol named 'true_warmth'" in said
+    requested = (
+        "--model",
+        f"{model}:make",
+        "--hold",
+        "zero",
+        "--known-start",
+        "--effects",
+        "scale",
+    )
+    output = tmp_path / "told.json"
+    done("diagnose", record, *requested, "--leave-out", "bend", "--json", output)
+    content = json.loads(output.read_text("utf-8"))
+    assert [cause["effect"] for cause in content["causes"]] == ["bent_scale"]
+    statement = refused("diagnose", record, "--effects", "scale")
+    assert "no symbol named 'true_warmth'" in statement
 
 
 def test_what_a_model_of_ones_own_does_not_have_is_told(tmp_path: Path) -> None:
     model, record = _oven(tmp_path)
-    own = ("--model", f"{model}:make")
-    said = refused("identify", record, *own, "--profile", "T", "--columns", "warmth=w")
-    assert "--profile is not there for a model of your own" in said
-    assert "'w', which --columns names for 'warmth', is not in the header" in said
+    item = ("--model", f"{model}:make")
+    statement = refused("identify", record, *item, "--profile", "T", "--columns", "warmth=w")
+    assert "--profile is not there for a model of your own" in statement
+    assert "'w', which --columns names for 'warmth', is not in the header" in statement
     assert "oven.py has no function 'mak'" in refused("diagnose", record, "--model", f"{model}:mak")
-    said = refused("diagnose", record, "--model", model)
-    assert "say which function of" in said
-    assert "it has 'make', as" in said
+    statement = refused("diagnose", record, "--model", model)
+    assert "say which function of" in statement
+    assert "it has 'make', as" in statement
     assert "there is no file" in refused("diagnose", record, "--model", "none.py:make")
-    said = refused("identify", record, "--hold", "zero")
-    assert "--hold is said of a model of your own; add --model FILE.py:FUNCTION." in said
+    statement = refused("identify", record, "--hold", "zero")
+    assert "--hold is said of a model of your own; add --model FILE.py:FUNCTION." in statement
     (tmp_path / "bad.py").write_text("1 / 0", encoding="utf-8")
-    said = refused("identify", record, "--model", tmp_path / "bad.py")
-    assert "bad.py cannot make a model (ZeroDivisionError: division by zero)" in said
+    statement = refused("identify", record, "--model", tmp_path / "bad.py")
+    assert "bad.py cannot make a model (ZeroDivisionError: division by zero)" in statement

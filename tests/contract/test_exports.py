@@ -42,25 +42,30 @@ def played(
     path: Path, time: Floats, inputs: Mapping[str, Floats], kind: str = "CoSimulation", **more: Any
 ) -> Any:
     """Return what fmpy makes of an FMU whose inputs are lines between samples."""
-    given = np.zeros(time.size, dtype=[("time", float), *((n, float) for n in inputs)])
-    given["time"] = time
+    arguments = np.zeros(time.size, dtype=[("time", float), *((n, float) for n in inputs)])
+    arguments["time"] = time
     for name, values in inputs.items():
-        given[name] = values
+        arguments[name] = values
     return fmpy.simulate_fmu(
-        str(path), fmi_type=kind, input=given, stop_time=float(time[-1]), relative_tolerance=1e-8,
-        output_interval=float(time[1]), **more,
-    )  # fmt: skip
+        str(path),
+        fmi_type=kind,
+        input=arguments,
+        stop_time=float(time[-1]),
+        relative_tolerance=1e-8,
+        output_interval=float(time[1]),
+        **more,
+    )
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_an_fmu_is_valid_and_describes_its_ports(fmi: int) -> None:
     assert validate_fmu(str(fmu_of(fmi))) == []
-    told = fmpy.read_model_description(str(fmu_of(fmi)))
-    assert told.fmiVersion == ("2.0" if fmi == 2 else "3.0")
-    assert told.coSimulation.modelIdentifier == told.modelExchange.modelIdentifier == "P_885_51"
-    variables = {v.name: v for v in told.modelVariables}
-    inputs = [v.name for v in told.modelVariables if v.causality == "input"]
-    outputs = {v.name: v.unit for v in told.modelVariables if v.causality == "output"}
+    output = fmpy.read_model_description(str(fmu_of(fmi)))
+    assert output.fmiVersion == ("2.0" if fmi == 2 else "3.0")
+    assert output.coSimulation.modelIdentifier == output.modelExchange.modelIdentifier == "P_885_51"
+    variables = {v.name: v for v in output.modelVariables}
+    inputs = [v.name for v in output.modelVariables if v.causality == "input"]
+    outputs = {v.name: v.unit for v in output.modelVariables if v.causality == "output"}
     assert inputs == ["voltage", "load_force"]
     assert outputs == {
         "current": "A", "charge": "C", "displacement": "m", "velocity": "m/s", "blocked_force": "N",
@@ -75,27 +80,27 @@ def test_an_fmu_with_input_derivatives_agrees_with_the_independent_reference(
     tmp_path: Path,
 ) -> None:
     time, voltage, expected = reference_run()
-    told = fmpy.read_model_description(str(fmu_of(2)))
-    numbers = {v.name: v.valueReference for v in told.modelVariables}
+    output = fmpy.read_model_description(str(fmu_of(2)))
+    numbers = {v.name: v.valueReference for v in output.modelVariables}
     unpacked = fmpy.extract(str(fmu_of(2)), str(tmp_path))
     slave = FMU2Slave(
-        guid=told.guid, unzipDirectory=unpacked, instanceName="one",
-        modelIdentifier=told.coSimulation.modelIdentifier,
+        guid=output.guid, unzipDirectory=unpacked, instanceName="one",
+        modelIdentifier=output.coSimulation.modelIdentifier,
     )  # fmt: skip
     slave.instantiate()
     slave.setupExperiment(startTime=0.0, tolerance=1e-9)
     slave.enterInitializationMode()
     slave.exitInitializationMode()
-    found, steps = [], np.diff(time)
+    result, steps = [], np.diff(time)
     for k, step in enumerate(steps):
         slave.setReal([numbers["voltage"]], [voltage[k]])
         slope = (voltage[k + 1] - voltage[k]) / step
         slave.setRealInputDerivatives([numbers["voltage"]], [1], [slope])
         slave.doStep(currentCommunicationPoint=time[k], communicationStepSize=step)
-        found.append(slave.getReal([numbers["displacement"], numbers["blocked_force"]]))
+        result.append(slave.getReal([numbers["displacement"], numbers["blocked_force"]]))
     slave.terminate()
     slave.freeInstance()
-    x, force = np.array(found).T
+    x, force = np.array(result).T
     assert off(x, expected.displacement[1:]) < 1e-6
     assert off(force, expected.blocked_force[1:]) < 1e-6
 
@@ -106,8 +111,8 @@ def test_an_fmu_whose_inputs_are_held_comes_to_the_reference(fmi: int) -> None:
     errors = []
     for parts in (4, 16):
         fine = np.linspace(0.0, time[-1], parts * (time.size - 1) + 1)
-        found = played(fmu_of(fmi), fine, {"voltage": np.interp(fine, time, voltage)})
-        x = np.interp(time, found["time"], found["displacement"])
+        result = played(fmu_of(fmi), fine, {"voltage": np.interp(fine, time, voltage)})
+        x = np.interp(time, result["time"], result["displacement"])
         errors.append(off(x, expected.displacement))
     assert errors[1] == pytest.approx(errors[0] / 4.0, rel=0.1)
     assert errors[1] < 1e-3
@@ -115,15 +120,17 @@ def test_an_fmu_whose_inputs_are_held_comes_to_the_reference(fmi: int) -> None:
 
 def test_model_exchange_agrees_with_the_independent_reference() -> None:
     time, voltage, expected = reference_run()
-    found = played(fmu_of(2), time, {"voltage": voltage}, "ModelExchange")
-    assert off(np.interp(time, found["time"], found["displacement"]), expected.displacement) < 1e-3
+    result = played(fmu_of(2), time, {"voltage": voltage}, "ModelExchange")
+    assert (
+        off(np.interp(time, result["time"], result["displacement"]), expected.displacement) < 1e-3
+    )
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_parameters_and_loads_of_an_fmu_act_as_in_the_model(fmi: int) -> None:
     time = np.linspace(0.0, 5e-3, 501)
     held = np.full(501, -32.0)
-    found = played(
+    result = played(
         fmu_of(fmi), time, {"voltage": 0.0 * time + 60.0, "load_force": held},
         start_values={"k_L": 6.0, "m_B": 0.2},
     )  # fmt: skip
@@ -132,7 +139,7 @@ def test_parameters_and_loads_of_an_fmu_act_as_in_the_model(fmi: int) -> None:
         model, time, np.column_stack([0.0 * time + 60.0, held]), np.zeros(len(model.state_names)),
         rtol=1e-8,
     )  # fmt: skip
-    x = np.interp(time, found["time"], found["displacement"])
+    x = np.interp(time, result["time"], result["displacement"])
     assert off(x, expected.y[:, model.output_names.index("displacement")]) < 1e-5
 
 
@@ -142,14 +149,14 @@ def test_an_fmu_starts_settled_where_it_is_told(tmp_path: Path) -> None:
         "export", "fmu", "--stack", STACK, "--start-voltage", "60", "--history", "120,0", "-o", path
     )
     time = np.linspace(0.0, 0.02, 201)
-    found = played(path, time, {"voltage": np.full(201, 60.0)})["displacement"]
+    result = played(path, time, {"voltage": np.full(201, 60.0)})["displacement"]
     settled = psa.settled_at(psa.stack_model(STACK), 60.0, (120.0, 0.0))
     there = psa.simulate(settled, time, np.full(201, 60.0), as_exported=True).displacement
-    assert found[0] == pytest.approx(there[0], rel=1e-9)
-    assert np.ptp(found) < 1e-9
+    assert result[0] == pytest.approx(there[0], rel=1e-9)
+    assert np.ptp(result) < 1e-9
     relaxed = psa.settled_at(psa.stack_model(STACK), 60.0)
     other = psa.simulate(relaxed, time, np.full(201, 60.0), as_exported=True).displacement
-    assert abs(found[0] - other[0]) > 1e-7
+    assert abs(result[0] - other[0]) > 1e-7
 
 
 def test_options_name_an_fmu_and_keep_the_sensor(tmp_path: Path) -> None:
@@ -157,15 +164,15 @@ def test_options_name_an_fmu_and_keep_the_sensor(tmp_path: Path) -> None:
     psa.save_model(model, tmp_path / "m.json")
     base = ("export", "fmu", "--model", tmp_path / "m.json", "-o", tmp_path / "x.fmu")
     assert "sensor_nonlinearity" in done(*base, "--name", "my_stack").out
-    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    assert told.coSimulation.modelIdentifier == "my_stack"
-    assert not [v.name for v in told.modelVariables if v.name.startswith("nonlinearity")]
+    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    assert output.coSimulation.modelIdentifier == "my_stack"
+    assert not [v.name for v in output.modelVariables if v.name.startswith("nonlinearity")]
     done(*base, "--include-sensor", "--author", "A. N. Other", "--version", "4.2")
-    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    names = [v.name for v in told.modelVariables]
+    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    names = [v.name for v in output.modelVariables]
     assert "measured_displacement" in names
     assert "nonlinearity_angle" in names
-    assert (told.author, told.version) == ("A. N. Other", "4.2")
+    assert (output.author, output.version) == ("A. N. Other", "4.2")
 
 
 def test_the_same_model_gives_the_same_bytes_and_carries_itself(tmp_path: Path) -> None:
@@ -226,23 +233,23 @@ def test_a_check_finds_a_description_that_was_spoiled(tmp_path: Path) -> None:
 def test_a_step_of_fixed_length_is_exported_for_co_simulation(tmp_path: Path) -> None:
     path = tmp_path / "fixed.fmu"
     done("export", "fmu", "--stack", STACK, "--solver", "fixed", "--step", "100us", "-o", path)
-    told = fmpy.read_model_description(str(path))
-    assert told.modelExchange is None
-    assert float(told.defaultExperiment.stepSize) == 1e-4
+    output = fmpy.read_model_description(str(path))
+    assert output.modelExchange is None
+    assert float(output.defaultExperiment.stepSize) == 1e-4
     time, voltage, expected = reference_run()
-    found = played(path, time, {"voltage": voltage}, step_size=2e-4)
-    x = np.interp(time, found["time"], found["displacement"])
+    result = played(path, time, {"voltage": voltage}, step_size=2e-4)
+    x = np.interp(time, result["time"], result["displacement"])
     assert off(x, expected.displacement) < 0.02
-    said = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
-    assert "--step" in said
+    statement = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
+    assert "--step" in statement
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_c_for_a_controller_errs_as_little_as_it_says(precision: str, tmp_path: Path) -> None:
     compiler = shutil.which("cc") or pytest.skip("no C compiler")
-    said = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
+    statement = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
                 "--precision", precision, "-o", tmp_path / "code").out  # fmt: skip
-    assert "substeps" in said or "%" in said
+    assert "substeps" in statement or "%" in statement
     time, voltage, expected = reference_run()
     (tmp_path / "code" / "play.c").write_text(
         '#include "stack.h"\n'
@@ -262,13 +269,13 @@ def test_c_for_a_controller_errs_as_little_as_it_says(precision: str, tmp_path: 
          "play.c", "stack.c", "-lm"],
         cwd=tmp_path / "code", check=True,
     )  # fmt: skip
-    found = np.zeros(time.size - 1)
-    given = np.ascontiguousarray(voltage[1:])
+    result = np.zeros(time.size - 1)
+    inputs = np.ascontiguousarray(voltage[1:])
     double = ctypes.POINTER(ctypes.c_double)
     ctypes.CDLL(str(library)).play(
-        len(given), given.ctypes.data_as(double), found.ctypes.data_as(double)
+        len(inputs), inputs.ctypes.data_as(double), result.ctypes.data_as(double)
     )
-    assert off(found, expected.displacement[1:]) < 1e-3
+    assert off(result, expected.displacement[1:]) < 1e-3
 
 
 def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None:
@@ -295,12 +302,12 @@ def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None
 @slow
 def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> None:
     archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.svg"
-    said = done("export", "ssp", "-o", archive, "--picture", picture).out
+    statement = done("export", "ssp", "-o", archive, "--picture", picture).out
     parts = [c.name for c in read_ssd(str(archive)).system.elements]
     assert parts == ["controller", "compensator", "amplifier", "stack", "flexure"]
-    assert "reference" in said
+    assert "reference" in statement
     assert "controller" in picture.read_text("utf-8")
-    found = simulate_ssp(
+    result = simulate_ssp(
         str(archive), stop_time=2e-3, step_size=2.5e-6,
         input={"reference": lambda t: 4e-6 * (1 - np.cos(500 * np.pi * t))},
     )  # fmt: skip
@@ -311,7 +318,7 @@ def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> No
     starts = np.array([s.start for s in model.structure.states])
     whole = psa.run(model, time, inputs, starts, hold="linear")
     expected = whole.y[:, model.output_names.index("stage_position")]
-    position = np.interp(time, found["time"], found["stage_position"])
+    position = np.interp(time, result["time"], result["stage_position"])
     assert off(position, expected) < 0.005
 
 
@@ -320,9 +327,9 @@ def test_an_fmu_of_an_own_model_is_read_back_and_runs_alike(tmp_path: Path) -> N
     read = psa.fmu_model(path, free={"mu": (0.1, 10.0)}, values={"mu": 2.3})
     time = np.linspace(0.0, 10.0, 501)
     nothing, start = np.empty((501, 0)), np.array([2.0, 0.0])
-    own = psa.run(van_der_pol().with_values({"mu": 2.3}), time, nothing, start, rtol=1e-8)
-    found = psa.run(read, time, nothing, start, rtol=1e-8)
-    np.testing.assert_allclose(found.y, own.y, atol=1e-5)
+    item = psa.run(van_der_pol().with_values({"mu": 2.3}), time, nothing, start, rtol=1e-8)
+    result = psa.run(read, time, nothing, start, rtol=1e-8)
+    np.testing.assert_allclose(result.y, item.y, atol=1e-5)
     assert read.output_names == ("position",)
     with pytest.raises(psa.InputError, match="FMU"):
         psa.export_fmu(read, tmp_path / "again.fmu")
@@ -334,8 +341,8 @@ def test_parts_are_exported(part: str, tmp_path: Path) -> None:
     assert validate_fmu(str(tmp_path / "x.fmu")) == []
     done("export", "modelica", "--part", part, "-o", tmp_path / "x.mo", "--name", "Part")
     values = psa.part_model(part).values
-    told = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    starts = {v.name: v.start for v in told.modelVariables if v.causality == "parameter"}
+    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    starts = {v.name: v.start for v in output.modelVariables if v.causality == "parameter"}
     assert {n: float(starts[n]) for n in values} == dict(values)
 
 

@@ -31,12 +31,12 @@ def off(found: Floats, expected: Floats) -> float:
 @pytest.mark.parametrize("stack", ["PTBS200", "WYDS0808020", STACK])
 def test_a_simulation_agrees_with_the_independent_reference(stack: str) -> None:
     time, voltage, expected = reference_run(stack)
-    found = psa.simulate(psa.stack_model(stack), time, voltage, from_rest_at_zero=True, rtol=1e-8)
-    assert off(found.displacement, expected.displacement) < AGREES
+    result = psa.simulate(psa.stack_model(stack), time, voltage, from_rest_at_zero=True, rtol=1e-8)
+    assert off(result.displacement, expected.displacement) < AGREES
     for name, values in expected.states.items():
-        assert off(found.states[name], values) < 10.0 * AGREES, name
-    assert off(found.outputs["blocked_force"], expected.blocked_force) < AGREES
-    assert off(found.outputs["charge"], expected.charge) < AGREES
+        assert off(result.states[name], values) < 10.0 * AGREES, name
+    assert off(result.outputs["blocked_force"], expected.blocked_force) < AGREES
+    assert off(result.outputs["charge"], expected.charge) < AGREES
 
 
 def test_the_command_simulates_a_voltage_and_writes_every_output_with_its_unit(
@@ -127,12 +127,12 @@ def test_what_the_sensor_shows_late_is_late_by_its_time(
 ) -> None:
     model = psa.stack_model(STACK).with_effect(psa.EFFECTS[name], values)
     time = np.linspace(0.0, 2.0, 4001)
-    found = psa.simulate(model, time, 50.0 - 50.0 * np.cos(2.0 * np.pi * time))
-    x = found.outputs["displacement"]
+    result = psa.simulate(model, time, 50.0 - 50.0 * np.cos(2.0 * np.pi * time))
+    x = result.outputs["displacement"]
     spline = make_interp_spline(time, x, 5)
     expected = shown(x, spline.derivative(1)(time), spline.derivative(2)(time))
     smooth = (np.abs((2.0 * time) % 1.0 - 0.5) < 0.3) & (time > 0.5)
-    late = found.outputs["measured_displacement"]
+    late = result.outputs["measured_displacement"]
     assert np.max(np.abs(late - expected)[smooth]) < 2e-3 * np.max(np.abs(late - x))
 
 
@@ -144,18 +144,18 @@ def test_a_gain_of_0_removes_an_effect_exactly(name: str) -> None:
     one, other = (
         psa.simulate(m, time, voltage, from_rest_at_zero=True, rtol=1e-9) for m in (plain, with_it)
     )
-    shown = [t.outputs["measured_displacement"] for t in (one, other)]
-    assert off(shown[1], shown[0]) < 1e-8
+    items = [t.outputs["measured_displacement"] for t in (one, other)]
+    assert off(items[1], items[0]) < 1e-8
 
 
 def test_every_effect_is_listed_and_shown_with_equation_source_and_bounds() -> None:
     listed = done("effects", "--quiet").out.split()
     assert listed == list(psa.EFFECTS)
     assert len(listed) >= 27
-    shown = done("effects", "slow_creep").words
+    displayed = done("effects", "slow_creep").words
     for part in ("creep_gain (z_1 + z_2 + z_3)", "Croft, Shed and Devasia", "belongs to plant",
                  "creep_time s 0.100", "0 to 0.500"):  # fmt: skip
-        assert part in shown
+        assert part in displayed
     assert "did you mean slow_creep" in refused("effects", "slow_crep")
     for name, effect in psa.EFFECTS.items():
         assert effect.belongs_to in ("plant", "drive", "sensor", "environment"), name
@@ -209,13 +209,15 @@ MISTAKES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_a_mistake_in_a_model_file_is_named(case: str, saved: Path, tmp_path: Path) -> None:
-    change, said = MISTAKES[case]
+    change, statement = MISTAKES[case]
     content = json.loads(saved.read_text("utf-8"))
     change(content)
     saved.write_text(json.dumps(content), encoding="utf-8")
-    told = refused("export", "modelica", "--model", saved, "-o", tmp_path / "x.mo", folder=tmp_path)
-    assert said in told
-    assert "model.json" in told
+    output = refused(
+        "export", "modelica", "--model", saved, "-o", tmp_path / "x.mo", folder=tmp_path
+    )
+    assert statement in output
+    assert "model.json" in output
     with pytest.raises(psa.InputError, match=r"model\.json"):
         psa.load_model(saved)
 
@@ -225,9 +227,9 @@ def test_mistakes_of_a_model_file_are_told_together(saved: Path) -> None:
     for change, _ in (MISTAKES["no number"], MISTAKES["interval"], MISTAKES["unknown effect"]):
         change(content)
     saved.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(psa.InputError) as told:
+    with pytest.raises(psa.InputError) as output:
         psa.load_model(saved)
-    assert len(told.value.problems) >= 2
+    assert len(output.value.problems) >= 2
     saved.write_text("{", encoding="utf-8")
     with pytest.raises(psa.InputError, match="is not JSON"):
         psa.load_model(saved)
@@ -241,8 +243,8 @@ def test_named_stacks_have_their_published_figures() -> None:
     assert (values["C_p"], values["u_rated"]) == (1.5e-6, 120.0)
     stroke = values["k_L"] * 120.0 * (1.0 / values["k_P"] + 1.0 / values["k_B"])
     assert 0.86 * stroke == pytest.approx(18e-6, rel=0.01)
-    shown = done("stacks", STACK).words
-    assert "C_p 1.50000 uF Yang and Zhu 2015" in shown
+    displayed = done("stacks", STACK).words
+    assert "C_p 1.50000 uF Yang and Zhu 2015" in displayed
     with pytest.raises(psa.InputError, match=r"P-885\.51"):
         psa.stack_model("P-885.52")
 
@@ -279,9 +281,9 @@ def test_an_effect_of_ones_own_is_shown_simulated_and_saved_by_reference(
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     assert "pickup_gain" in done("effects", "sensor_pickup", "--effects", "pickup_of_mine").out
-    own = psa.own_effects("pickup_of_mine")["sensor_pickup"]
+    item = psa.own_effects("pickup_of_mine")["sensor_pickup"]
     plain = psa.stack_model(STACK)
-    model = plain.with_effect(own, {"pickup_gain": 4e-9, "pickup_time": 0.05})
+    model = plain.with_effect(item, {"pickup_gain": 4e-9, "pickup_time": 0.05})
     time = np.linspace(0.0, 0.4, 801)
     voltage = np.where(time < 0.1, 1000.0 * time, 100.0)
     picked = (
@@ -298,7 +300,7 @@ def test_an_effect_of_ones_own_is_shown_simulated_and_saved_by_reference(
     assert "equations" not in Path("m.json").read_text("utf-8")
     with pytest.raises(psa.InputError, match="pickup_of_mine"):
         psa.load_model("m.json")
-    assert psa.load_model("m.json", [own]).values["pickup_gain"] == 4e-9
+    assert psa.load_model("m.json", [item]).values["pickup_gain"] == 4e-9
     export = ("export", "modelica", "--model", "m.json", "-o", "x.mo", "--include-sensor")
     assert command(*export).code == 2
     done(*export, "--effects", "pickup_of_mine")
@@ -321,22 +323,22 @@ def van_der_pol() -> psa.Model:
 def test_a_model_of_ones_own_is_saved_with_its_equations_as_text(tmp_path: Path) -> None:
     model, file = van_der_pol().with_values({"mu": 4.0 / 3.0}), tmp_path / "m.json"
     psa.save_model(model, file)
-    content, found = json.loads(file.read_text("utf-8")), psa.load_model(file)
+    content, result = json.loads(file.read_text("utf-8")), psa.load_model(file)
     assert content["components"] == ["VanDerPol"]
-    own = content["own"]["VanDerPol"]
-    assert own["equations"] == {
+    item = content["own"]["VanDerPol"]
+    assert item["equations"] == {
         "der": {"x": "v", "v": "mu * (1 - x ** 2) * v - x"}, "out": {"position": "x"},
     }  # fmt: skip
-    assert own["states"][0]["start"] == own["states"][0]["nominal"] == 2.0
-    assert own["parameters"][0]["bounds"] == [0.1, 10.0]
-    assert dict(found.values) == {"mu": 4.0 / 3.0}
-    psa.save_model(found, tmp_path / "again.json")
+    assert item["states"][0]["start"] == item["states"][0]["nominal"] == 2.0
+    assert item["parameters"][0]["bounds"] == [0.1, 10.0]
+    assert dict(result.values) == {"mu": 4.0 / 3.0}
+    psa.save_model(result, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
     time = np.linspace(0.0, 20.0, 201)
     x0, none = np.array([2.0, 0.0]), np.zeros((201, 0))
-    one, other = (psa.run(m, time, none, x0).y for m in (model, found))
+    one, other = (psa.run(m, time, none, x0).y for m in (model, result))
     np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
-    fmus = [psa.export_fmu(m, tmp_path / f"{k}.fmu") for k, m in enumerate((model, found))]
+    fmus = [psa.export_fmu(m, tmp_path / f"{k}.fmu") for k, m in enumerate((model, result))]
     assert fmus[0].read_bytes() == fmus[1].read_bytes()
     assert "passed all" in done("check", fmus[0]).words
     out = tmp_path / "m.mo"
@@ -365,7 +367,7 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
     np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
     np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
     plan = ("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
-    said = done(
+    statement = done(
         *plan,
         "--hold",
         "zero",
@@ -376,19 +378,19 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
         "--figure",
         tmp_path / "p.png",
     ).words
-    assert "start: the start values of the model, but for x = 0.3 m" in said
+    assert "start: the start values of the model, but for x = 0.3 m" in statement
     held = [0.3]
     for u in time[:-1]:  # x' = u - 5 x with u constant over 0.01 s
         held.append(held[-1] * np.exp(-0.05) + u / 5.0 * (1.0 - np.exp(-0.05)))
     places = table(tmp_path / "x.csv")["place [mm]"]
     np.testing.assert_allclose(places, 1e3 * np.array(held), rtol=1e-5)
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
-    told = refused(*plan, "--start", "y=1", folder=tmp_path)
-    assert "no state or input 'y' to start from" in told
+    output = refused(*plan, "--start", "y=1", folder=tmp_path)
+    assert "no state or input 'y' to start from" in output
     assert "give NAME=VALUE" in refused(*plan, "--value", "k", folder=tmp_path)
     for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
-        told = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
-        assert "A model of your own is for `psa identify`," in told
+        output = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
+        assert "A model of your own is for `psa identify`," in output
 
 
 def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
@@ -396,7 +398,7 @@ def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
     psa.save_model(van_der_pol(), file)
     plain = json.loads(file.read_text("utf-8"))
     code = f"__import__('pathlib').Path({str(trace)!r}).touch() or x"
-    for text, said in (
+    for text, statement in (
         (code, "has a Python Call"),
         ("x.real", "has a Python Attribute"),
         ("open(x)", "calls open of 1"),
@@ -405,9 +407,9 @@ def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
     ):
         plain["own"]["VanDerPol"]["equations"]["der"]["v"] = text
         file.write_text(json.dumps(plain), encoding="utf-8")
-        told = refused("export", "modelica", "--model", file, "-o", tmp_path / "x.mo")
-        assert said in told
-        assert "'own.VanDerPol.equations.der.v'" in told
+        output = refused("export", "modelica", "--model", file, "-o", tmp_path / "x.mo")
+        assert statement in output
+        assert "'own.VanDerPol.equations.der.v'" in output
     assert not trace.exists()
 
 
@@ -419,8 +421,8 @@ def test_a_model_of_ones_own_runs_as_scipy_runs_it_and_is_identified() -> None:
     )  # fmt: skip
     model = van_der_pol()
     truth = model.with_values({"mu": 2.3})
-    found = psa.run(truth, time, np.empty((1001, 0)), np.array([2.0, 0.0]), rtol=1e-9).y[:, 0]
-    np.testing.assert_allclose(found, plant.y[0], atol=1e-6)
+    result = psa.run(truth, time, np.empty((1001, 0)), np.array([2.0, 0.0]), rtol=1e-9).y[:, 0]
+    np.testing.assert_allclose(result, plant.y[0], atol=1e-6)
     noise = 2e-3 * np.random.default_rng(1).standard_normal(1001)
     record = {"time": time, "position": plant.y[0] + noise}
     fitted = psa.identify(model, record, starts=2)
@@ -466,12 +468,14 @@ def test_parts_are_connected_by_their_ports() -> None:
     time = np.linspace(0.0, 0.2, 2001)
     u = np.clip(2e4 * (time - 1e-3), 0.0, 100.0)
     y = psa.run(whole, time, u[:, None], np.zeros(len(whole.state_names)), hold="linear").y[-1]
-    found = dict(zip(whole.output_names, y, strict=True))
-    contact, tip = stage.values["k_c"], found["stack_displacement"]
+    result = dict(zip(whole.output_names, y, strict=True))
+    contact, tip = stage.values["k_c"], result["stack_displacement"]
     series = 1.0 / (1.0 / contact + 1e-7)  # contact and flexure of 1e7 N/m
     free = 15.96e-6 / (1.0 + series / psa.stack_model(STACK).values["k_B"])
     assert tip == pytest.approx(free, rel=5e-3)
-    assert found["stage_stage_position"] == pytest.approx(tip * contact / (contact + 1e7), rel=1e-3)
+    assert result["stage_stage_position"] == pytest.approx(
+        tip * contact / (contact + 1e7), rel=1e-3
+    )
 
 
 def test_a_closed_loop_follows_its_reference() -> None:
@@ -480,8 +484,8 @@ def test_a_closed_loop_follows_its_reference() -> None:
     wanted = 4e-6 * np.minimum(time / 0.02, 1.0)
     inputs = np.array([[w if n == "reference" else 0.0 for n in model.input_names] for w in wanted])
     starts = np.array([s.start for s in model.structure.states])
-    found = psa.run(model, time, inputs, starts, hold="linear").y
-    position = found[:, model.output_names.index("stage_position")]
+    result = psa.run(model, time, inputs, starts, hold="linear").y
+    position = result[:, model.output_names.index("stage_position")]
     assert position[-1] == pytest.approx(4e-6, rel=1e-3)
     assert position.max() < 4.2e-6
 

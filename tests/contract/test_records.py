@@ -83,9 +83,9 @@ def test_options_say_what_a_file_does_not(tmp_path: Path) -> None:
     bare = lines(tmp_path / "bare.csv", *ROWS)
     assert_same(psa.read_record(bare, columns="time=1:s,voltage=2:V,displacement=3:um"))
     scope = lines(tmp_path / "scope.csv", "t,CH1,CH2", *ROWS)
-    told = psa.read_record(scope, columns="time=t:s,voltage=CH1:15V,displacement=CH2:10um")
-    np.testing.assert_allclose(told.voltage, 15.0 * V)
-    np.testing.assert_allclose(moved(told), 1e-5 * X)
+    record = psa.read_record(scope, columns="time=t:s,voltage=CH1:15V,displacement=CH2:10um")
+    np.testing.assert_allclose(record.voltage, 15.0 * V)
+    np.testing.assert_allclose(moved(record), 1e-5 * X)
     timeless = write(tmp_path / "none.csv", {k: v for k, v in PLAIN.items() if "time" not in k})
     assert_same(psa.read_record(timeless, sample_time=1e-3))
 
@@ -116,12 +116,12 @@ def test_of_several_tables_in_a_file_one_is_chosen(tmp_path: Path) -> None:
 
 def test_every_mistake_of_all_files_is_told_at_once(tmp_path: Path) -> None:
     bad = lines(tmp_path / "bad.csv", HEADER, "0,a,1", "1,2,b", *ROWS[2:])
-    told = refused(
+    output = refused(
         "diagnose", bad, tmp_path / "absent.csv", "--model", tmp_path / "no.json",
         "-o", tmp_path / "missing" / "m.json", "--stiffness", "-3", folder=tmp_path,
     )  # fmt: skip
     parts = ("'a'", "'b'", "line 2", "line 3", "absent.csv", "no.json", "create it first", "-3 N/m")
-    assert [part for part in parts if part not in told] == []
+    assert [part for part in parts if part not in output] == []
 
 
 def test_records_that_cannot_be_fitted_are_refused(tmp_path: Path) -> None:
@@ -137,8 +137,8 @@ def test_records_that_cannot_be_fitted_are_refused(tmp_path: Path) -> None:
 
 
 def test_tables_and_arrays_are_records(tmp_path: Path) -> None:
-    for given in (PLAIN, pd.DataFrame(PLAIN)):
-        assert_same(psa.record_from(given))
+    for inputs in (PLAIN, pd.DataFrame(PLAIN)):
+        assert_same(psa.record_from(inputs))
     frame = pd.DataFrame({"t": T, "u": V, "y": X})
     assert_same(psa.record_from(frame, columns="time=t:s,voltage=u:V,displacement=y:um"))
     made = psa.Record(name="loop", time=T, voltage=V, displacement=1e-6 * X)

@@ -22,7 +22,7 @@ STACK = "P-885.51"
 
 def test_a_designed_experiment_keeps_its_limits_and_separates(tmp_path: Path) -> None:
     out, page = tmp_path / "v.csv", tmp_path / "page.html"
-    said = done(
+    statement = done(
         "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "60",
         "--high", "60", "--rate", "2000", "--family", "triangles", "--starts", "1",
         "--separate", "sensor_nonlinearity", "slow_creep", "-o", out, "--report", page, "--still",
@@ -35,11 +35,11 @@ def test_a_designed_experiment_keeps_its_limits_and_separates(tmp_path: Path) ->
     assert voltage.max() <= 60.0
     assert np.max(np.abs(np.diff(voltage) / np.diff(time))) <= 2000.0 * 1.001
     assert np.ptp(voltage) > 30.0
-    assert "sensor nonlinearity" in said
-    assert "slow creep" in said
+    assert "sensor nonlinearity" in statement
+    assert "slow creep" in statement
     assert Page(page.read_text("utf-8")).loaded == []
-    told = refused("design", "experiment", "--stack", STACK, "--duration", "1", "--samples", "0")
-    assert "0 samples" in told
+    output = refused("design", "experiment", "--stack", STACK, "--duration", "1", "--samples", "0")
+    assert "0 samples" in output
 
 
 def test_a_designed_voltage_follows_its_path_on_the_independent_reference(tmp_path: Path) -> None:
@@ -105,8 +105,8 @@ def devices(tmp_path: Path) -> Path:
             values, reference.from_samples(time, voltage), time, breakpoints=list(time)
         ).displacement
         noise = 3e-3 * np.random.default_rng(seed).standard_normal(time.size)
-        shown = {"time [s]": time, "voltage [V]": voltage, "displacement [um]": 1e6 * x + noise}
-        write(folder / path, shown)
+        displayed = {"time [s]": time, "voltage [V]": voltage, "displacement [um]": 1e6 * x + noise}
+        write(folder / path, displayed)
     (folder / "third.csv").write_text("time [s],voltage [V],displacement [um]\n0,a,1\n")
     return folder
 
@@ -115,8 +115,8 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
     devices: Path, tmp_path: Path
 ) -> None:
     out, page = tmp_path / "results", tmp_path / "population.html"
-    said = done("batch", devices, "-o", out, "--workers", "1", "--report", page).words
-    assert "5 devices: 4 done, 1 refused." in said
+    statement = done("batch", devices, "-o", out, "--workers", "1", "--report", page).words
+    assert "5 devices: 4 done, 1 refused." in statement
     with (out / "summary.csv").open(encoding="utf-8") as stream:
         rows = {row["device"]: row for row in csv.DictReader(stream)}
     first = float(rows["first"]["k_L [N/V]"])
@@ -129,9 +129,9 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
             rules = json.loads((DATA / "schemas" / f"{kind}.schema.json").read_text("utf-8"))
             content = json.loads((out / name / f"{kind}.json").read_text("utf-8"))
             jsonschema.Draft202012Validator(rules).validate(content)
-    shown = Page(page.read_text("utf-8"))
-    assert shown.loaded == []
-    assert "third" in shown.text
+    displayed = Page(page.read_text("utf-8"))
+    assert displayed.loaded == []
+    assert "third" in displayed.text
     (devices / "second.csv").write_bytes((devices / "fourth.csv").read_bytes())
     again = psa.batch(devices, out, workers=1)
     assert again.kept == 4
@@ -163,8 +163,8 @@ def test_friction_of_a_motor_is_found_with_its_size(tmp_path: Path) -> None:
     assert "friction" in page.text
     frame = d.to_frame()
     held = frame["held_out"].to_numpy()
-    missed = (frame["w [rad/s]"] - frame["w_extended [rad/s]"]).to_numpy()
-    assert float(np.sqrt(np.mean(missed[held] ** 2))) == pytest.approx(
+    misfit = (frame["w [rad/s]"] - frame["w_extended [rad/s]"]).to_numpy()
+    assert float(np.sqrt(np.mean(misfit[held] ** 2))) == pytest.approx(
         d.errors[0].extended, rel=0.01
     )
     psa.export_fmu(d.model, tmp_path / "motor.fmu")
@@ -177,20 +177,20 @@ def test_a_posterior_holds_the_truth(tmp_path: Path) -> None:
     x = clean.displacement
     y = x + 1e-3 * np.ptp(x) * np.random.default_rng(5).standard_normal(len(x))
     record = psa.Record(name="loops", time=time, voltage=voltage, displacement=y)
-    found = psa.sample(
+    result = psa.sample(
         psa.stack_model(STACK), [record], free=["k_L", "tau"], draws=150, tune=150, chains=1, seed=1
     )
-    frame, truth = found.to_frame(), psa.stack_model(STACK).values
-    told = {row.name: row for row in frame.itertuples(index=False)}
+    frame, truth = result.to_frame(), psa.stack_model(STACK).values
+    output = {row.name: row for row in frame.itertuples(index=False)}
     for name in ("k_L", "tau"):
-        assert abs(told[name].mean - truth[name]) < 5.0 * told[name].sd
-        assert told[name].low < told[name].mean < told[name].high
-        assert told[name].sd < 0.05 * truth[name]
-    found.save(tmp_path / "p.nc")
+        assert abs(output[name].mean - truth[name]) < 5.0 * output[name].sd
+        assert output[name].low < output[name].mean < output[name].high
+        assert output[name].sd < 0.05 * truth[name]
+    result.save(tmp_path / "p.nc")
     tree = arviz.from_netcdf(tmp_path / "p.nc")
     assert {"posterior", "prior_predictive", "posterior_predictive"} < set(tree.groups())
     draws = tree.posterior["k_L"].to_numpy()
     assert draws.shape == (1, 150)
-    assert np.mean(draws) == pytest.approx(told["k_L"].mean, rel=1e-6)
+    assert np.mean(draws) == pytest.approx(output["k_L"].mean, rel=1e-6)
     with pytest.raises(psa.InputError, match="'nothing' is no parameter"):
         psa.sample(psa.stack_model(STACK), [record], free=["nothing"])

@@ -50,10 +50,10 @@ def columns(csv: bytes) -> FloatArray:
 
 def test_the_linear_response_is_found() -> None:
     u = voltages(1, 6)
-    shown = linear_response(u, driven(u))
+    displayed = linear_response(u, driven(u))
     truth = np.fft.rfft(IMPULSE, n=N, axis=2).transpose(2, 0, 1)
     truth[[0, -1]] = 0.0  # no voltage there
-    np.testing.assert_allclose(shown, truth, atol=1e-12 * 1e-6)
+    np.testing.assert_allclose(displayed, truth, atol=1e-12 * 1e-6)
 
 
 @pytest.mark.parametrize("axis", range(AXES))
@@ -68,11 +68,11 @@ def test_what_is_left_is_the_answer_to_the_own_voltage(axis: int) -> None:
 @pytest.mark.parametrize("axis", range(AXES))
 def test_a_bend_of_the_own_answer_stays(axis: int) -> None:
     u = voltages(1, 6)
-    y, own = driven(u), driven(u, axis)[:, axis]
-    bend = 0.3e-6 * (own / 1e-6) ** 3
+    y, item = driven(u), driven(u, axis)[:, axis]
+    bend = 0.3e-6 * (item / 1e-6) ** 3
     y[:, axis] += bend
     x = columns(OneAxis(axis, 1, 2, 1, RATE).csv([saved(u), saved(y)]))[:, 2]
-    lost = x - 1e6 * (own + bend)[:, 2, 0]
+    lost = x - 1e6 * (item + bend)[:, 2, 0]
     # of six experiments the two other voltages can explain a third of what is no linear answer
     assert np.std(lost) < 0.6e6 * np.std(bend[:, 2, 0])
 
@@ -85,8 +85,8 @@ def test_a_test_signal_is_judged_by_the_response_of_the_training_signals() -> No
     t, v, x = columns(csv).T
     assert len(t) == 2 * N
     np.testing.assert_allclose(v, np.tile(test[:, 1, 2, 0], 2), atol=6e-7)
-    own = 1e6 * driven(test, 1)[:, 1, 2]
-    np.testing.assert_allclose(x, own.T.reshape(-1), atol=6e-5)
+    item = 1e6 * driven(test, 1)[:, 1, 2]
+    np.testing.assert_allclose(x, item.T.reshape(-1), atol=6e-5)
 
 
 @pytest.mark.slow

@@ -53,12 +53,12 @@ BRIEF = Effort(draws=2, starts=1, steps=3)
 
 def rivals(share: float = 0.2, bent: str = "sensor_nonlinearity") -> list[Rival]:
     """A bent sensor (or another effect) and creep, each of a share of its ordinary size."""
-    found = []
+    items = []
     for effect in (psa.EFFECTS[n] for n in (bent, "slow_creep")):
         model = psa.stack_model(STACK).with_effect(effect)
         size = share * model.parameter(effect.gain or "").typical(model.values)
-        found.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
-    return found
+        items.append(rival_of_effect(model.with_values({effect.gain or "": size}), effect, FREE))
+    return items
 
 
 def excess(record: psa.Signals, limits: Limits, capacitance: float | None) -> list[str]:
@@ -134,9 +134,9 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
         return psa.Record(name=kind, time=time, voltage=wave.values(p + share * way, time))
 
     frozen = criterion.at(at(0.0)).frozen
-    told = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
-    seen = (criterion.at(at(step)).value - criterion.at(at(-step)).value) / (2.0 * step)
-    assert told == pytest.approx(seen, rel=0.15, abs=0.02)
+    output = (frozen(at(step)) - frozen(at(-step))) / (2.0 * step)
+    observed = (criterion.at(at(step)).value - criterion.at(at(-step)).value) / (2.0 * step)
+    assert output == pytest.approx(observed, rel=0.15, abs=0.02)
 
 
 def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> None:
@@ -145,14 +145,14 @@ def test_standard_errors_are_those_of_the_papers_equations_in_plain_numpy() -> N
     model, record = psa.stack_model(STACK), planned("triangles", limits)
     rival = rival_of_model("base", model, names)
     criterion = Information(rival, names, "D", [NOISE.on_grid(limits, limits.samples)])
-    told = criterion.standard_errors(record)
+    values = criterion.standard_errors(record)
     columns = [_slope(model, record, n, 1e-3 * abs(model.values[n])) for n in names]
     columns += [_slope(model, record, "f_H", 1e-3 * model.values["h_ref"]), np.ones(record.n)]
     jacobian = np.column_stack(columns) / NOISE.rms
     size = np.linalg.norm(jacobian, axis=0)
     covariance = np.linalg.inv((jacobian / size).T @ (jacobian / size))
-    seen = np.sqrt(np.diag(covariance)) / size
-    np.testing.assert_allclose([told[n] for n in names], seen[: len(names)], rtol=0.02)
+    observed = np.sqrt(np.diag(covariance)) / size
+    np.testing.assert_allclose([values[n] for n in names], observed[: len(names)], rtol=0.02)
 
 
 def _slope(model: psa.Model, record: psa.Record, name: str, step: float) -> FloatArray:
@@ -176,7 +176,7 @@ def _slope(model: psa.Model, record: psa.Record, name: str, step: float) -> Floa
 def test_the_distance_is_what_an_independent_optimiser_leaves() -> None:
     other, one = rivals(1.0)
     record, noise = planned("steps"), [NOISE.on_grid(LIMITS, LIMITS.samples)]
-    found = Separation((one, other), noise).distances(record)
+    values = Separation((one, other), noise).distances(record)
     target = one.predict(record, np.zeros(one.size))
     root = np.linalg.cholesky(other.information + 1e-12 * np.eye(other.size)).T
 
@@ -185,7 +185,7 @@ def test_the_distance_is_what_an_independent_optimiser_leaves() -> None:
         return np.concatenate([gap, root @ delta])
 
     best = least_squares(rest, np.zeros(other.size), x_scale="jac", method="lm")
-    assert found[one.name, other.name] == pytest.approx(2.0 * best.cost, rel=0.05)
+    assert values[one.name, other.name] == pytest.approx(2.0 * best.cost, rel=0.05)
 
 
 def test_what_is_known_of_a_rival_holds_it_back() -> None:
@@ -221,14 +221,14 @@ def test_coloured_noise_tells_less_of_slow_voltages() -> None:
 def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> None:
     limits = Limits(0.0, 80.0, 1.0, 200, rate=2e3)
     kinds: tuple[Kind, ...] = ("steps", "multisine")
-    told = separating_experiment(rivals(), NOISE, limits, kinds=kinds, effort=BRIEF)
-    assert told.record.n == limits.samples
-    assert excess(told.record, limits, None) == []
-    assert told.factor("sine") > 1.0
-    assert told.factor("triangle") > 1.0
-    assert "plays" not in " ".join(sentences(told))
-    assert "3 runs, each from rest" in " ".join(sentences(replace(told, plays=3)))
-    assert "look alike" in " ".join(sentences(replace(told, plays=None)))
+    separated = separating_experiment(rivals(), NOISE, limits, kinds=kinds, effort=BRIEF)
+    assert separated.record.n == limits.samples
+    assert excess(separated.record, limits, None) == []
+    assert separated.factor("sine") > 1.0
+    assert separated.factor("triangle") > 1.0
+    assert "plays" not in " ".join(sentences(separated))
+    assert "3 runs, each from rest" in " ".join(sentences(replace(separated, plays=3)))
+    assert "look alike" in " ".join(sentences(replace(separated, plays=None)))
     rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     sharp = informative_experiment(rival, NOISE, limits, optimality="A", kinds=kinds, effort=BRIEF)
     assert excess(sharp.record, limits, None) == []
@@ -240,16 +240,16 @@ def test_a_design_is_better_than_the_usual_voltages_and_within_its_limits() -> N
 
 def test_the_more_noise_the_more_plays() -> None:
     pair, record = tuple(rivals()), planned("triangles")
-    found: list[float] = []
+    numbers: list[float] = []
     for noise in (1e-10, 2e-9, 2e-6):
         criterion = Separation(pair, [SensorNoise(noise).on_grid(LIMITS, LIMITS.samples)])
         distances = criterion.distances(record)
         chance = {r.name: naming_probability(r, [o], distances, 0.0)
                   for r, o in (pair, pair[::-1])}  # fmt: skip
-        found.append(plays_of(criterion, None, record, chance) or np.inf)
-    assert found[0] == 1
-    assert 1 < found[1] <= 5
-    assert found[-1] == np.inf
+        numbers.append(plays_of(criterion, None, record, chance) or np.inf)
+    assert numbers[0] == 1
+    assert 1 < numbers[1] <= 5
+    assert numbers[-1] == np.inf
 
 
 def test_the_usual_voltages_slow_down_where_the_rate_asks() -> None:
@@ -290,12 +290,12 @@ def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> N
 
 
 def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
-    told = refused(
+    output = refused(
         "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
         "-o", tmp_path / "no" / "where.csv",
     )  # fmt: skip
     for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
-        assert part in told
+        assert part in output
 
 
 #: The loop from record to name is run once: with pytest-xdist by one process.
@@ -392,9 +392,9 @@ def test_the_command_writes_the_record_and_says_so(
     path = command._beside(tmp_path / "diagnosis.json")
     assert path == tmp_path / "diagnosis_next.csv"
     d = files.with_next(loop.ambiguous, path, lambda _: None)
-    said = json.loads(d.to_json())["next_experiment"]
-    assert said["voltage_csv"] == str(path)
-    assert set(said["separates"]) == set(said["chance"]) == {HIDDEN, RIVAL}
+    statement = json.loads(d.to_json())["next_experiment"]
+    assert statement["voltage_csv"] == str(path)
+    assert set(statement["separates"]) == set(statement["chance"]) == {HIDDEN, RIVAL}
     assert str(path) in " ".join(psa.story(d, width=400).split())
     record = psa.read_record(path, need_displacement=False)
     np.testing.assert_array_equal(record.voltage, loop.design.record.columns["voltage"])

@@ -54,8 +54,8 @@ def a_design() -> TrackedInput:
 
 
 def on_reference(voltage: np.ndarray) -> float:
-    shown = creeping_displacement(scanner().values, a_scan().time, voltage)
-    return error_of(a_scan(), shown).rms_percent
+    values = creeping_displacement(scanner().values, a_scan().time, voltage)
+    return error_of(a_scan(), values).rms_percent
 
 
 def test_a_designed_scan_follows_its_path_on_the_independent_reference() -> None:
@@ -66,17 +66,17 @@ def test_a_designed_scan_follows_its_path_on_the_independent_reference() -> None
 
 
 def test_the_simulator_says_what_the_reference_says() -> None:
-    shown = creeping_displacement(scanner().values, a_scan().time, a_design().voltage)
-    assert shown == pytest.approx(a_design().response.displacement, abs=1e-4 * a_scan().span)
+    values = creeping_displacement(scanner().values, a_scan().time, a_design().voltage)
+    assert values == pytest.approx(a_design().response.displacement, abs=1e-4 * a_scan().span)
 
 
 def test_trials_make_up_for_parameters_that_are_off() -> None:
     values = wrong_values(scanner(), np.random.default_rng(3))
     voltage, errors = a_design().voltage, []
     for _ in range(3):
-        shown = creeping_displacement(values, a_scan().time, voltage)
-        errors.append(error_of(a_scan(), shown).rms_percent)
-        voltage = correct(scanner(), a_scan(), voltage, shown)
+        displayed = creeping_displacement(values, a_scan().time, voltage)
+        errors.append(error_of(a_scan(), displayed).rms_percent)
+        voltage = correct(scanner(), a_scan(), voltage, displayed)
     assert errors[2] < 1.0
     assert errors[2] < 0.5 * errors[0]
 
@@ -89,28 +89,28 @@ def test_trials_make_up_for_parameters_that_are_off() -> None:
     ],
 )
 def test_limits_are_kept_and_cost_accuracy(limits: AmplifierLimits) -> None:
-    found = track(scanner(), a_scan(), limits, corrections=0)
-    rate = np.abs(np.diff(found.voltage) / np.diff(a_scan().time))
+    result = track(scanner(), a_scan(), limits, corrections=0)
+    rate = np.abs(np.diff(result.voltage) / np.diff(a_scan().time))
     assert rate.max() <= limits.max_rate * (1.0 + 1e-6)
-    assert np.abs(found.response.current).max() <= limits.max_current * (1.0 + 1e-3)
-    assert found.error.rms > 10.0 * a_design().error.rms
+    assert np.abs(result.response.current).max() <= limits.max_current * (1.0 + 1e-3)
+    assert result.error.rms > 10.0 * a_design().error.rms
 
 
 @slow
 def test_minimax_lowers_the_largest_error() -> None:
-    found = track(scanner(), a_scan(), minimax=True, corrections=1)
-    assert found.error.largest < 0.98 * a_design().error.largest
+    result = track(scanner(), a_scan(), minimax=True, corrections=1)
+    assert result.error.largest < 0.98 * a_design().error.largest
 
 
 @pytest.mark.parametrize("payload", [0.5, 0.0])
 def test_a_quickest_move_is_near_the_bound_of_the_linear_part(payload: float) -> None:
     model = scanner(payload)
-    found = quickest_move(model, 2e-6, 10e-6, LIMITS)
+    quick_move = quickest_move(model, 2e-6, 10e-6, LIMITS)
     bound = bang_bang_bound(model.values, 2e-6, 10e-6, -20.0, 120.0)
-    assert bound < found.move_time < 1.1 * bound
-    assert found.residual < 1e-3
-    assert abs(found.offset) < 1e-3
-    voltage = found.response.voltage
+    assert bound < quick_move.move_time < 1.1 * bound
+    assert quick_move.residual < 1e-3
+    assert abs(quick_move.offset) < 1e-3
+    voltage = quick_move.response.voltage
     assert voltage.min() >= -20.0 - 1e-6
     assert voltage.max() <= 120.0 + 1e-6
 
@@ -120,20 +120,20 @@ def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow() -> None:
     """Downwards that is 21 % over the bound of the linear part; a bang-bang move has no ramps."""
     begin, end = 10e-6, 2e-6
     model = scanner(0.0)
-    found = quickest_move(model, begin, end, LIMITS)
-    own = own_bang_bang(model, found)
-    assert own is not None
-    assert bang_bang_bound(model.values, begin, end, -20.0, 120.0) < own
-    assert own < found.move_time < 1.02 * own
+    quick_move = quickest_move(model, begin, end, LIMITS)
+    value = own_bang_bang(model, quick_move)
+    assert value is not None
+    assert bang_bang_bound(model.values, begin, end, -20.0, 120.0) < value
+    assert value < quick_move.move_time < 1.02 * value
 
 
 def test_a_move_obeys_rate_and_current() -> None:
     limits = AmplifierLimits(-20.0, 120.0, max_rate=8e5, max_current=0.9)
-    found = quickest_move(scanner(), 2e-6, 10e-6, limits, intervals=60)
-    rate = np.diff(found.response.voltage) / np.diff(found.response.time)
+    quick_move = quickest_move(scanner(), 2e-6, 10e-6, limits, intervals=60)
+    rate = np.diff(quick_move.response.voltage) / np.diff(quick_move.response.time)
     assert np.abs(rate).max() <= 8e5 * (1.0 + 1e-6)
-    assert np.abs(found.response.current).max() <= 0.9 * (1.0 + 1e-3)
-    assert found.residual < 1e-3
+    assert np.abs(quick_move.response.current).max() <= 0.9 * (1.0 + 1e-3)
+    assert quick_move.residual < 1e-3
 
 
 def test_mistakes_are_told_together(tmp_path: Path) -> None:
@@ -162,8 +162,8 @@ def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
     )
     arguments = ["design", "input", "--model", str(tmp_path / "m.json"), "-o", str(out)]
     more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html"), "--still"]
-    found = done(*arguments, *more)
-    rows = [line for line in found.out.splitlines() if line.startswith("designed")]
+    ended = done(*arguments, *more)
+    rows = [line for line in ended.out.splitlines() if line.startswith("designed")]
     simulated, fmu = (float(row.split()[-2]) for row in rows[:2])
     assert fmu == pytest.approx(simulated, rel=0.02)
     record = psa.read_record(out)
@@ -179,17 +179,17 @@ def test_a_path_beyond_the_voltage_is_followed_to_the_limit_and_says_so() -> Non
     """A peak that is cut by 10 %: what is left of the error stands where the limit does."""
     need = float(invert(scanner(), a_scan()).response.voltage.max())
     limits = AmplifierLimits(max_voltage=0.9 * need)
-    found = invert(scanner(), a_scan(), limits).response
-    assert found.voltage.max() <= limits.max_voltage + 1e-9
-    (said,) = binding(found, limits)
-    assert f"highest voltage, {limits.max_voltage:.4g} V" in said
-    spans = re.findall(r"from (\S+) to (\S+) ms", said)
+    result = invert(scanner(), a_scan(), limits).response
+    assert result.voltage.max() <= limits.max_voltage + 1e-9
+    (statement,) = binding(result, limits)
+    assert f"highest voltage, {limits.max_voltage:.4g} V" in statement
+    spans = re.findall(r"from (\S+) to (\S+) ms", statement)
     first, last = float(spans[0][0]), float(spans[-1][1])
     time = 1e3 * a_scan().time
     peak = time[np.argmax(a_scan().displacement)]
     assert first < peak < last
-    shown = creeping_displacement(scanner().values, a_scan().time, found.voltage)
-    error = np.abs(shown - a_scan().displacement) / a_scan().span
+    values = creeping_displacement(scanner().values, a_scan().time, result.voltage)
+    error = np.abs(values - a_scan().displacement) / a_scan().span
     assert error.max() == pytest.approx(0.11, abs=0.03)
     assert np.median(error[time < first]) < 0.003
 
@@ -200,10 +200,10 @@ def test_a_search_that_fails_leaves_the_cut_inversion(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(Program, "solve", fails)
     limits = AmplifierLimits(max_voltage=50.0)
-    found = track(scanner(), a_scan(), limits)
-    assert not found.by_program
-    assert found.voltage.max() <= 50.0
-    assert found.error.rms == pytest.approx(invert(scanner(), a_scan(), limits).error.rms)
+    result = track(scanner(), a_scan(), limits)
+    assert not result.by_program
+    assert result.voltage.max() <= 50.0
+    assert result.error.rms == pytest.approx(invert(scanner(), a_scan(), limits).error.rms)
 
 
 def test_a_measured_trial_corrects_the_voltage(tmp_path: Path) -> None:
@@ -211,17 +211,17 @@ def test_a_measured_trial_corrects_the_voltage(tmp_path: Path) -> None:
     values = wrong_values(scanner(), np.random.default_rng(3))
     path, folder = a_scan(), tmp_path
     played = invert(scanner(), path).response.voltage
-    shown = creeping_displacement(values, path.time, played)
+    displayed = creeping_displacement(values, path.time, played)
     psa.save_model(scanner(), folder / "m.json")
     um = {"displacement [um]": 1e6 * path.displacement}
     psa.write_record(folder / "p.csv", {"time [s]": path.time, **um})
-    measured = {"voltage [V]": played, "displacement [um]": 1e6 * shown}
+    measured = {"voltage [V]": played, "displacement [um]": 1e6 * displayed}
     psa.write_record(folder / "t.csv", {"time [s]": path.time, **measured})
     words = ["design", "input", "--model", str(folder / "m.json"), "-o", str(folder / "c.csv")]
     words += ["--target", str(folder / "p.csv"), "--measured", str(folder / "t.csv")]
     done(*words, "--report", folder / "c.html", "--still")
     again = creeping_displacement(values, path.time, psa.read_record(folder / "c.csv").voltage)
-    assert error_of(path, again).rms < 0.5 * error_of(path, shown).rms
+    assert error_of(path, again).rms < 0.5 * error_of(path, displayed).rms
     assert "played in the trial" in (folder / "c.html").read_text(encoding="utf-8")
     psa.write_record(folder / "t.csv", {"time [s]": 0.1 * path.time, **measured})
     assert "record the whole path" in refused(*words)
@@ -236,8 +236,8 @@ def test_the_equations_of_an_fmu_have_the_derivatives_of_the_model(tmp_path: Pat
     slopes = []
     for dynamics, symbolic in ((fmu_equations(unpacked, model), False), (dynamics_of(model), True)):
         step = interval_of(dynamics, symbolic=symbolic).step
-        given = [x, inner, ca.MX(ca.DM([0.0, 10.0])), ca.MX(ca.DM([0.0, 1e-5]))]
-        residual = step.call(given, not symbolic, False)[0]
+        items = [x, inner, ca.MX(ca.DM([0.0, 10.0])), ca.MX(ca.DM([0.0, 1e-5]))]
+        residual = step.call(items, not symbolic, False)[0]
         f = ca.Function("slopes", [x, inner], [ca.jacobian(residual, inner)])
         slopes.append(np.array(f(np.full(7, 0.1), np.linspace(0.1, 0.3, 14))))
     assert slopes[0] == pytest.approx(slopes[1], abs=1e-5 * np.abs(slopes[1]).max())

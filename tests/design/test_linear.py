@@ -30,18 +30,18 @@ def mass() -> psa.Model:
 
 
 def test_matrices_are_those_of_the_equations_at_rest() -> None:
-    found = psa.linearize(mass(), {"force": 5.0})
-    x = float(found.x[0])
+    result = psa.linearize(mass(), {"force": 5.0})
+    x = float(result.x[0])
     assert K * x + E * x**3 == pytest.approx(5.0, rel=1e-9)
     slope = -(K + 3 * E * x**2) / M
-    assert found.a == pytest.approx(np.array([[0, 1], [slope, -C / M]]), rel=1e-6)
-    assert found.b == pytest.approx(np.array([[0], [1 / M]]))
-    assert found.d == pytest.approx(np.array([[0], [0.1]]))
-    assert np.abs(found.rates) == pytest.approx(0.0, abs=1e-6)
+    assert result.a == pytest.approx(np.array([[0, 1], [slope, -C / M]]), rel=1e-6)
+    assert result.b == pytest.approx(np.array([[0], [1 / M]]))
+    assert result.d == pytest.approx(np.array([[0], [0.1]]))
+    assert np.abs(result.rates) == pytest.approx(0.0, abs=1e-6)
     hertz = np.sqrt(-slope) / (2 * np.pi)
-    assert f"mode {hertz:.6g} Hz" in repr(found)
+    assert f"mode {hertz:.6g} Hz" in repr(result)
     at = 2j * np.pi * 3.0
-    response = found.response(np.array([6 * np.pi]))[0, 0, 0]
+    response = result.response(np.array([6 * np.pi]))[0, 0, 0]
     assert response == pytest.approx(1 / (M * at**2 + C * at - slope * M), rel=1e-6)
 
 
@@ -58,19 +58,19 @@ def test_a_point_need_not_rest_and_names_are_checked() -> None:
 
 def test_a_stack_is_its_linear_part() -> None:
     stack = psa.stack_model("P-885.51")
-    found = psa.linearize(stack)
-    part, row = linear_part(stack), found.output_names.index("displacement")
+    result = psa.linearize(stack)
+    part, row = linear_part(stack), result.output_names.index("displacement")
     omega = 2 * np.pi * np.array([1.0, 300.0, 8000.0])
-    column = found.input_names.index("voltage")
-    assert found.response(omega)[:, row, column] == pytest.approx(part.response(omega), rel=1e-9)
-    assert "f_H" in found.held
+    column = result.input_names.index("voltage")
+    assert result.response(omega)[:, row, column] == pytest.approx(part.response(omega), rel=1e-9)
+    assert "f_H" in result.held
 
 
 def test_an_fmu_has_the_matrices_of_its_model(tmp_path: Path) -> None:
     path = psa.export_fmu(mass(), tmp_path / "mass.fmu")
-    own, there = (psa.linearize(m, {"force": 5.0}) for m in (mass(), psa.fmu_model(path, free={})))
+    item, there = (psa.linearize(m, {"force": 5.0}) for m in (mass(), psa.fmu_model(path, free={})))
     for name in "abcd":
-        assert getattr(there, name) == pytest.approx(getattr(own, name), rel=1e-5, abs=1e-6)
+        assert getattr(there, name) == pytest.approx(getattr(item, name), rel=1e-5, abs=1e-6)
     whole = psa.fmu_model(path, free={}, interface="co-simulation")
     with pytest.raises(psa.InputError, match="run as a whole has no equations"):
         psa.linearize(whole)
@@ -82,10 +82,10 @@ def test_margins_are_those_of_a_known_loop() -> None:
     u = ca.SX.sym("u")
     rates = [u - x[0], x[0] - x[1], x[1] - x[2]]
     lags = psa.ode_model({"x": x, "u": u, "ode": rates, "y": x[2]}, name="lags")
-    told = psa.margins(psa.linearize(lags), ([4.0], [1.0]))
-    assert told["gain_margin"] == pytest.approx(2.0, rel=1e-6)
-    assert told["gain_margin_at"] == pytest.approx(np.sqrt(3) / (2 * np.pi), rel=1e-6)
-    assert told["stable"] == 1.0
+    values = psa.margins(psa.linearize(lags), ([4.0], [1.0]))
+    assert values["gain_margin"] == pytest.approx(2.0, rel=1e-6)
+    assert values["gain_margin_at"] == pytest.approx(np.sqrt(3) / (2 * np.pi), rel=1e-6)
+    assert values["stable"] == 1.0
     assert psa.margins(psa.linearize(lags), ([9.0], [1.0]))["stable"] == 0.0
 
 
@@ -95,15 +95,15 @@ def test_an_observer_follows_what_is_not_measured(tmp_path: Path) -> None:
     t = step * np.arange(n, dtype=float)
     force = 0.5 * rng.standard_normal(n)
     plant = psa.run(mass(), t, force[:, None], np.zeros(2), hold="zero")
-    shown: FloatArray = plant.y[:, 0] + 1e-4 * rng.standard_normal(n)
+    values: FloatArray = plant.y[:, 0] + 1e-4 * rng.standard_normal(n)
     point = psa.linearize(mass())
     made = psa.observer(point, input_noise={"force": 0.5}, output_noise={"place": 1e-4}, step=step)
     path = psa.export_fmu(made, tmp_path / "observer.fmu")
     there = psa.fmu_model(path, free={})
-    u = np.column_stack([np.zeros(n), shown])
-    found = psa.run(there, t, u, np.zeros(2), hold="zero").y
+    u = np.column_stack([np.zeros(n), values])
+    result = psa.run(there, t, u, np.zeros(2), hold="zero").y
     names = [o.removeprefix("estimated_") for o in there.output_names]
-    place, speed = (found[:, names.index(q)] for q in ("x", "v"))
+    place, speed = (result[:, names.index(q)] for q in ("x", "v"))
     settled = slice(n // 10, None)
     errors = [np.std((a - b)[settled]) for a, b in zip((place, speed), plant.x.T, strict=True)]
     assert errors[0] < 0.6e-4  # less than the sensor's

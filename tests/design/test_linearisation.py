@@ -122,9 +122,9 @@ def test_the_plant_is_the_reference() -> None:
         rtol=1e-8,
     )  # fmt: skip
     stack = DriftingStack(values, PERIOD)
-    found = np.array([stack.step(u) for u in voltage.tolist()])
+    result = np.array([stack.step(u) for u in voltage.tolist()])
     span = float(np.ptp(expected.displacement))
-    assert found == pytest.approx(expected.displacement, abs=2e-5 * span)
+    assert result == pytest.approx(expected.displacement, abs=2e-5 * span)
 
 
 def test_observer_gives_the_force_of_equation_8() -> None:
@@ -146,8 +146,8 @@ def test_observer_gives_the_force_of_equation_8() -> None:
     expected = solve_ivp(rate, (0.0, time[-1]), [0.0], t_eval=time, rtol=1e-9, atol=1e-9,
                          max_step=1e-3).y[0]  # fmt: skip
     observer = psa.HysteresisObserver(psa.stack_values(model, PERIOD, at_electrodes=True))
-    found = np.array([observer.step(voltage(t)) for t in time.tolist()])
-    assert np.abs(found - expected).max() < 1e-3 * float(np.ptp(expected))
+    result = np.array([observer.step(voltage(t)) for t in time.tolist()])
+    assert np.abs(result - expected).max() < 1e-3 * float(np.ptp(expected))
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -160,8 +160,8 @@ def test_values_off_by_ten_percent_are_learnt(seed: int) -> None:
     assert tracked.nonlinearity(LAST) < 1e-4
     assert tracked.estimate is not None
     for name in ("A", "beta", "n", "k_L"):
-        found, true = tracked.estimate.parameters[name], model.values[name]
-        assert found == pytest.approx(true, rel=0.01), name
+        result, true = tracked.estimate.parameters[name], model.values[name]
+        assert result == pytest.approx(true, rel=0.01), name
 
 
 @slow
@@ -194,13 +194,13 @@ def test_a_wanted_motion_in_metres_is_where_the_stack_goes() -> None:
     wanted = 4e-6 * (1.0 - np.cos(np.pi * time)) * (1.0 - 0.15 * time)
     for forward in (psa.FeedForward(values), psa.AdaptiveFeedForward(
         psa.identifier_for(model, period, noise=NOISE).values)):  # fmt: skip
-        plant, x, missed = DriftingStack(model.values, period), 0.0, []
+        plant, x, misfit = DriftingStack(model.values, period), 0.0, []
         for w in wanted.tolist():
             u = forward.step(w) if isinstance(forward, psa.FeedForward) else forward.step(w, x)
             x = plant.step(u)
-            missed.append(x - w)
+            misfit.append(x - w)
         slope = float(np.abs(np.gradient(wanted, period)).max())
-        assert np.abs(missed).max() < 1.1 * values["lag"] * slope + 2e-5 * np.ptp(wanted)
+        assert np.abs(misfit).max() < 1.1 * values["lag"] * slope + 2e-5 * np.ptp(wanted)
 
 
 def test_volts_are_no_motion() -> None:
@@ -224,7 +224,7 @@ def test_jumps_across_the_range_are_followed(name: str, samples: int, limit: flo
     forward = psa.FeedForward(psa.stack_values(model, PERIOD, at_electrodes=True))
     per_volt = p["k_L"] * (1.0 / p["k_P"] + 1.0 / p["k_B"])
     turns = p["u_rated"] * np.array([0.0, 1.0, 0.0, 0.8, 0.8, -0.2, 1.0, 1.0, 0.5, 0.5])
-    force, last, missed = 0.0, 0.0, []
+    force, last, misfit = 0.0, 0.0, []
     for volts in np.interp(np.arange(9 * samples + 1) / samples, np.arange(10), turns):
         u = forward.step(float(per_volt * volts))
 
@@ -234,8 +234,8 @@ def test_jumps_across_the_range_are_followed(name: str, samples: int, limit: flo
 
         force = float(solve_ivp(slope, (0.0, 1.0), [force], rtol=1e-9, atol=1e-6).y[0, -1])
         last = u
-        missed.append((p["k_L"] * u + force) / p["k_L"] - volts)
-    assert np.abs(missed).max() < limit * p["u_rated"]
+        misfit.append((p["k_L"] * u + force) / p["k_L"] - volts)
+    assert np.abs(misfit).max() < limit * p["u_rated"]
 
 
 @cache
@@ -256,8 +256,8 @@ def test_recursion_is_recursive_least_squares_on_the_prediction() -> None:
     for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
         force = online.step(u, x)
         expected.step(u, x)
-        found = online.estimate.parameters
-        mine = [*(found[name] for name in TRACKED), force]
+        result = online.estimate.parameters
+        mine = [*(result[name] for name in TRACKED), force]
         rows.append([mine, [*expected.estimates, expected.f]])
     both = np.array(rows)
     sizes = np.abs(both[:, 1]).max(axis=0)
@@ -294,8 +294,8 @@ def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
             force = online.step(u, x)
             instance.set({"voltage": u, "position": x})
             instance.step(k * PERIOD, PERIOD)
-            found = online.estimate.parameters
-            expected = [*(found[name] for name in TRACKED), force]
+            result = online.estimate.parameters
+            expected = [*(result[name] for name in TRACKED), force]
             assert instance.get(names) == pytest.approx(expected, rel=1e-9, abs=1e-12)
 
 
@@ -311,11 +311,11 @@ def test_modelica_block_gives_what_the_stream_gives() -> None:
       rls.position = 1.4e-7*{wave.format("time - 1e-3")};
     end Driven;
     """
-    found = simulated(modelica_text(model) + harness, "Driven", 0.03)
+    result = simulated(modelica_text(model) + harness, "Driven", 0.03)
     online = psa.OnlineIdentification(model.values)
     for t in PERIOD * np.arange(61):
         u, x = (60.0 * (1.0 - np.cos(62.83185307179586 * (t - d))) for d in (0.0, 1e-3))
         force = online.step(float(u), 1.4e-7 * float(x))
-    assert found["rls.hysteresis_force"][-1] == pytest.approx(force, rel=1e-8)
+    assert result["rls.hysteresis_force"][-1] == pytest.approx(force, rel=1e-8)
     for name, value in online.estimate.parameters.items():
-        assert found[f"rls.{name}_hat"][-1] == pytest.approx(value, rel=1e-7), name
+        assert result[f"rls.{name}_hat"][-1] == pytest.approx(value, rel=1e-7), name

@@ -60,9 +60,9 @@ def test_a_mounted_stack_is_the_two_equations_with_the_mechanism(
     s = model.structure
     rows = [model.state_names.index(n) for n in ("y", "v_y", "x", "v_x")]
     zero, u = np.zeros(len(s.states)), [i.start for i in s.inputs]
-    found = np.array(s.slopes(0.0, zero, u, model.parameter_vector())[0])[np.ix_(rows, rows)]
+    result = np.array(s.slopes(0.0, zero, u, model.parameter_vector())[0])[np.ix_(rows, rows)]
     wanted = assembled(model.values, HEAVY if mounted else Mounting(0.0, 0.0, 0.0), acts_on)
-    np.testing.assert_allclose(found, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
+    np.testing.assert_allclose(result, wanted, rtol=1e-12, atol=1e-12 * np.abs(wanted).max())
 
 
 def test_a_load_on_the_mass_that_the_mechanism_pushes_on_is_refused() -> None:
@@ -85,11 +85,11 @@ def test_closed_loop_poles_are_those_of_the_assembled_masses(acts_on: str, share
     model = stack_model(STACK)
     if share:
         model = model.with_effect(EFFECTS["reciprocal_coupling"], {"reciprocal_gain": share})
-    found = mechanical_poles(mechanics_of(model, acts_on), HEAVY)
+    spectrum = mechanical_poles(mechanics_of(model, acts_on), HEAVY)
     expected = np.linalg.eigvals(assembled(model.values, HEAVY, acts_on, share))
     order = np.lexsort((expected.imag, np.round(np.abs(expected), 3)))
-    mine = np.lexsort((found.imag, np.round(np.abs(found), 3)))
-    assert found[mine] == pytest.approx(expected[order], rel=1e-8)
+    mine = np.lexsort((spectrum.imag, np.round(np.abs(spectrum), 3)))
+    assert spectrum[mine] == pytest.approx(expected[order], rel=1e-8)
 
 
 def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
@@ -120,9 +120,9 @@ def test_bandwidth_is_where_the_response_has_fallen_by_3_db() -> None:
     def size(f: float) -> float:
         return float(abs(C @ np.linalg.solve(2j * np.pi * f * np.eye(4) - A, B)))
 
-    found = bandwidth(mechanics_of(stack_model(STACK)), HEAVY)
-    assert size(found) == pytest.approx(size(0.0) / np.sqrt(2.0), rel=1e-6)
-    assert all(size(f) > size(found) for f in np.linspace(0.0, 0.999 * found, 200))
+    value = bandwidth(mechanics_of(stack_model(STACK)), HEAVY)
+    assert size(value) == pytest.approx(size(0.0) / np.sqrt(2.0), rel=1e-6)
+    assert all(size(f) > size(value) for f in np.linspace(0.0, 0.999 * value, 200))
 
 
 def test_wanted_damping_is_reached_within_the_limits() -> None:

@@ -65,21 +65,21 @@ def played(record: psa.Signals, seed: int) -> psa.Signals:
 
 @cache
 def sharp() -> Informative:
-    found = design_experiment(
+    informative = design_experiment(
         tanks(), LIMITS, noise={"high": NOISE, "low": NOISE}, known_start=True, effort=BRIEF
     )
-    assert isinstance(found, Informative)
-    return found
+    assert isinstance(informative, Informative)
+    return informative
 
 
 def test_inputs_keep_their_limits_and_begin_at_their_start_values() -> None:
     record = sharp().record
     assert (record.n, record.units) == (600, {"q": "m3/s", "r": "m3/s"})
     for name, first in (("q", 2e-4), ("r", 0.0)):
-        values, own = record.columns[name], LIMITS[name]
+        values, item = record.columns[name], LIMITS[name]
         assert values[0] == pytest.approx(first, abs=1e-12)
-        assert own.low <= values.min() < values.max() <= own.high
-        assert np.ptp(values) > 0.3 * own.span
+        assert item.low <= values.min() < values.max() <= item.high
+        assert np.ptp(values) > 0.3 * item.span
     rate = np.abs(np.diff(record.columns["q"]) / np.diff(record.time))
     assert rate.max() <= 4e-5 * (1.0 + 1e-6)
     assert abs(np.corrcoef(record.columns["q"], record.columns["r"])[0, 1]) < 0.95
@@ -97,11 +97,11 @@ def test_no_interval_leaves_the_bounds_of_its_parameter() -> None:
 
 
 def test_identify_is_as_sure_on_the_designed_record_as_was_predicted() -> None:
-    found = psa.identify(tanks(), played(sharp().record, 1), starts=1, known_start=True)
+    result = psa.identify(tanks(), played(sharp().record, 1), starts=1, known_start=True)
     for name, (low, high) in sharp().intervals.items():
         half = 0.5 * (high - low)
-        assert 1.96 * found.errors[name] == pytest.approx(half, rel=0.2)
-        assert abs(found.model.values[name] - TRUTH[name]) < 2.0 * half
+        assert 1.96 * result.errors[name] == pytest.approx(half, rel=0.2)
+        assert abs(result.model.values[name] - TRUTH[name]) < 2.0 * half
     before = played(sharp().record, 2)
     again = design_experiment(
         tanks(), LIMITS, records=[before], zeros=["low"], parameters=["c"], effort=BRIEF,
@@ -116,7 +116,7 @@ def test_identify_is_as_sure_on_the_designed_record_as_was_predicted() -> None:
 
 def test_what_does_not_fit_is_named() -> None:
     model = tanks()
-    for words, told in (
+    for words, output in (
         ({"limits": {"u": Limits(0.0, 1.0, 1.0, 100)}}, "'u', which is no input of 'tanks'"),
         ({"noise": 1e-3}, "give the noise of each by name"),
         ({"noise": {"middle": 1.0}}, "The noise of 'middle'"),
@@ -124,7 +124,7 @@ def test_what_does_not_fit_is_named() -> None:
         ({"parameters": ["d"]}, "no parameter 'd'"),
         ({"zeros": ["middle"]}, "`zeros` has 'middle'"),
     ):
-        with pytest.raises(psa.InputError, match=told):
+        with pytest.raises(psa.InputError, match=output):
             design_experiment(model, **{"limits": LIMITS, **words})  # type: ignore[arg-type]
 
 
@@ -141,20 +141,20 @@ def test_a_designed_record_tells_two_effects_apart(tmp_path: Path) -> None:
     columns = table(tmp_path / "next.csv")
     assert list(columns) == ["time [s]", "q [m3/s]", "r [m3/s]"]
     assert "The r to apply" in (tmp_path / "next.html").read_text("utf-8")
-    found = design_experiment(
+    result = design_experiment(
         tanks(), LIMITS, separate=["bend_of_q", "drag_in_h"], known_start=True, effort=BRIEF
     )
-    assert isinstance(found, Separated)
-    assert min(p.designed for p in found.pairs) > 0.0
-    assert all(math.isfinite(p) for p in found.chance.values())
+    assert isinstance(result, Separated)
+    assert min(p.designed for p in result.pairs) > 0.0
+    assert all(math.isfinite(p) for p in result.chance.values())
 
 
 def test_the_command_says_which_input_may_move(tmp_path: Path) -> None:
     psa.save_model(tanks(), tmp_path / "m.json")
     words = ("design", "experiment", "--model", tmp_path / "m.json", "--duration", "600")
     assert "add --input NAME=LOW:HIGH, of q, r." in refused(*words)
-    told = refused(*words, "--input", "q=1", "--low", "3", "--noise", "-1")
+    output = refused(*words, "--input", "q=1", "--low", "3", "--noise", "-1")
     for part in ("--input is 'q=1'", "--low is not there for a model", "--noise is -1"):
-        assert part in told
-    told = refused("design", "experiment", "--stack", "demo", "--duration", "1", "--known-start")
-    assert "--known-start is said of a model of your own" in told
+        assert part in output
+    output = refused("design", "experiment", "--stack", "demo", "--duration", "1", "--known-start")
+    assert "--known-start is said of a model of your own" in output

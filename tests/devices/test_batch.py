@@ -65,14 +65,14 @@ def stand_in(
     work: Callable[[DeviceTask], DeviceOutcome | None] = lambda task: None,
 ) -> list[str]:
     """Let the work on a device be something short in this process; return who was worked on."""
-    seen: list[str] = []
+    texts: list[str] = []
 
     def worked(task: DeviceTask, began: float) -> DeviceOutcome:
-        seen.append(task.job.device)
+        texts.append(task.job.device)
         return work(task) or DeviceOutcome(task.job.device, "done", 0.0)
 
     monkeypatch.setattr(device, "_worked", worked)
-    return seen
+    return texts
 
 
 def tasks(folder: Path, count: int) -> list[DeviceTask]:
@@ -140,18 +140,18 @@ def test_an_interrupt_ends_the_threads_and_says_what_is_kept(
         finally:
             ended.set()
 
-    seen = stand_in(monkeypatch, work)
+    texts = stand_in(monkeypatch, work)
     jobs = [t.job for t in tasks(tmp_path, 8)]
 
-    def progress(told: str) -> None:
-        if "d0: done" in told:
+    def progress(text: str) -> None:
+        if "d0: done" in text:
             raise KeyboardInterrupt
 
     out = tmp_path / "out"
     with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt, match="1 of 8 devices"):
         psa.batch(jobs, out, executor=pool, at_once=3, progress=progress)
     assert ended.wait(2.0)
-    assert len(seen) < 8
+    assert len(texts) < 8
     stand_in(monkeypatch)
     with ThreadPoolExecutor(2) as pool:
         assert psa.batch(jobs, out, executor=pool).kept == 1
@@ -170,11 +170,11 @@ def test_what_failed_is_tried_again_and_what_was_refused_is_not(
     stand_in(monkeypatch, work)
     with ThreadPoolExecutor(1) as pool:
         psa.batch(jobs, tmp_path / "out", executor=pool)
-        seen = stand_in(monkeypatch)
+        texts = stand_in(monkeypatch)
         psa.batch(jobs, tmp_path / "out", executor=pool)
-        assert seen == ["d1"]
+        assert texts == ["d1"]
         psa.batch(jobs, tmp_path / "out", executor=pool, options=psa.Options(stiffness=5e7))
-    assert sorted(seen) == ["d0", "d1", "d1", "d2"]
+    assert sorted(texts) == ["d0", "d1", "d1", "d2"]
 
 
 def found(task: DeviceTask) -> DeviceOutcome:
@@ -187,7 +187,7 @@ def found(task: DeviceTask) -> DeviceOutcome:
 def test_a_damaged_result_is_named_and_made_again(
     name: str, length: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, seen = tmp_path / "out", stand_in(monkeypatch, found)
+    out, observed = tmp_path / "out", stand_in(monkeypatch, found)
     jobs = [t.job for t in tasks(tmp_path, 5)]
     with ThreadPoolExecutor(1) as pool:
         assert len(psa.batch(jobs, out, executor=pool).findings) == 5
@@ -195,12 +195,12 @@ def test_a_damaged_result_is_named_and_made_again(
         # cut, or a digit is another one: still a file that can be read
         other = whole.replace(b"1", b"2", 1) if name != "device.json" else b"{}"
         (out / "d1" / name).write_bytes(other if length is None else whole[:length])
-        told = command("compare", out, "-o", tmp_path / "p.html").out
-        assert f"d1: failed: {out / 'd1' / name}: is damaged" in told
+        output = command("compare", out, "-o", tmp_path / "p.html").out
+        assert f"d1: failed: {out / 'd1' / name}: is damaged" in output
         assert "d1" in (tmp_path / "p.html").read_text("utf-8")
         again = psa.batch(jobs, out, executor=pool)
     assert (again.kept, again.counts, len(again.findings)) == (4, {"done": 5}, 5)
-    assert seen[5:] == ["d1"]
+    assert observed[5:] == ["d1"]
     assert (out / "d1" / "identification.json").stat().st_size > 300
 
 
@@ -278,10 +278,10 @@ def test_an_address_of_no_scheduler_is_told_in_a_sentence(
 ) -> None:
     pytest.importorskip("distributed")
     process = batch_command(records, tmp_path / "out", "--dask", address)
-    _, told = process.communicate(timeout=35)
+    _, output = process.communicate(timeout=35)
     assert process.returncode == 1
-    assert told.splitlines()[1:] == [told.splitlines()[-1]]
-    assert f"The scheduler at {address} cannot be reached" in told
+    assert output.splitlines()[1:] == [output.splitlines()[-1]]
+    assert f"The scheduler at {address} cannot be reached" in output
 
 
 def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,42 +296,42 @@ def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 @slow
 def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
     job = next(j for j in jobs_given(records) if j.device == "first")
-    given = [DeviceTask(psa.Job(f"d{k}", job.files), psa.Options(), "run") for k in range(3)]
-    own = Processes(1)
+    items = [DeviceTask(psa.Job(f"d{k}", job.files), psa.Options(), "run") for k in range(3)]
+    processes = Processes(1)
     try:
-        found = {}
-        for task, outcome in outcomes(given, own, 1):
-            found[task.job.device] = outcome
+        table = {}
+        for task, outcome in outcomes(items, processes, 1):
+            table[task.job.device] = outcome
             if task.job.device == "d0":  # the next begins with a process that is dying
                 (child,) = children._CHILDREN
                 os.kill(child.pid, signal.SIGKILL)
     finally:
-        own.end()
-    assert [found[f"d{k}"].status for k in range(3)] == ["done", "failed", "done"]
-    assert "ended (signal 9)" in found["d1"].problems[0]
+        processes.end()
+    assert [table[f"d{k}"].status for k in range(3)] == ["done", "failed", "done"]
+    assert "ended (signal 9)" in table["d1"].problems[0]
 
 
 @slow
 def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        found = psa.batch(records, tmp_path / "out", executor=pool)
-    assert found.counts == {"done": 2, "refused": 1}
+        result = psa.batch(records, tmp_path / "out", executor=pool)
+    assert result.counts == {"done": 2, "refused": 1}
 
 
 @slow
 def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     with executors.dask_client("local", 2) as client:
-        found = psa.batch(records, tmp_path / "out", executor=client)
-    assert found.counts == {"done": 2, "refused": 1}
+        result = psa.batch(records, tmp_path / "out", executor=client)
+    assert result.counts == {"done": 2, "refused": 1}
     assert psa.load_model(tmp_path / "out" / "first" / "model.json").provenance.free
 
 
 @slow
 def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
     (records / "third.csv").unlink()
-    found = psa.batch(records, tmp_path / "out", options=psa.Options(work="diagnose"), workers=2)
-    assert found.counts == {"done": 2}
+    result = psa.batch(records, tmp_path / "out", options=psa.Options(work="diagnose"), workers=2)
+    assert result.counts == {"done": 2}
     first, second = psa.read_findings([tmp_path / "out" / n for n in ("first", "second")])
     assert first.verdict == second.verdict == "adequate"
     assert first.trace is not None
@@ -362,15 +362,15 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
         if "done)" in line:
             break
     process.send_signal(number)
-    _, told = process.communicate(timeout=20)
+    _, output = process.communicate(timeout=20)
     assert process.returncode == (130 if number is signal.SIGINT else -9)
     if number is signal.SIGINT:
-        assert "of 3 devices are done. Kept: " in told
+        assert "of 3 devices are done. Kept: " in output
     before = stamps(out)
     again = batch_command(folder, out)
-    said, _ = again.communicate(timeout=120)
+    statement, _ = again.communicate(timeout=120)
     assert again.returncode == 0
-    assert "of them were there before" in said
+    assert "of them were there before" in statement
     assert before.items() <= stamps(out).items()
     assert len(list(out.glob("*/device.json"))) == 3
     assert not list(out.rglob(".psa_casadi-*"))

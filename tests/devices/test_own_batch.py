@@ -31,18 +31,18 @@ def test_a_heavy_motor_stands_out_of_a_population(tmp_path: Path) -> None:
     done = psa.batch(folder, tmp_path / "results", options=options, workers=2)
     assert done.counts == {"done": 6, "refused": 1}
     assert "no output of the model 'motor'" in " ".join(done.devices[-1].problems)
-    told = json.loads((tmp_path / "results" / "m1" / "identification.json").read_text("utf-8"))
+    content = json.loads((tmp_path / "results" / "m1" / "identification.json").read_text("utf-8"))
     alone = psa.identify(motor(), folder / "m1.csv", starts=1, known_start=True)
-    for name, parameter in told["parameters"].items():
+    for name, parameter in content["parameters"].items():
         assert parameter["value"] == pytest.approx(alone.model.values[name], rel=1e-6)
     saved = psa.load_model(tmp_path / "results" / "m1" / "model.json")
     assert saved.values == pytest.approx(alone.model.values, rel=1e-6)
     summary = (tmp_path / "results" / "summary.csv").read_text("utf-8").splitlines()
     assert "J [kg.m2]" in summary[0]
     assert not [n for n in summary[0].split(",") if "[m]" in n or "[times" in n]  # nothing in them
-    found = population(done.findings)
-    assert {(o.device, o.parameter) for o in found.outliers} == {("m4", "J")}
-    psa.write_population(found, tmp_path / "page.html")
+    result = population(done.findings)
+    assert {(o.device, o.parameter) for o in result.outliers} == {("m4", "J")}
+    psa.write_population(result, tmp_path / "page.html")
     assert "1 of 6 devices stands out: m4." in Page((tmp_path / "page.html").read_text()).text
     again = psa.batch(folder, tmp_path / "results", options=options, workers=1)
     assert again.kept == 7

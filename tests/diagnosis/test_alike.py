@@ -35,10 +35,10 @@ def test_bends_are_alike_where_no_resonance_shows(
 ) -> None:
     time = np.arange(200) / rate
     model, voltage = compose(BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
-    shown = simulate(model, time, voltage).displacement
-    experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=shown)),)
-    found = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
-    groups = Task(experiments, TABLE, STACK).alike(found)
+    displayed = simulate(model, time, voltage).displacement
+    experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
+    result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
+    groups = Task(experiments, TABLE, STACK).alike(result)
     assert tuple(tuple(sorted(group)) for group in groups) == alike
 
 
@@ -48,16 +48,16 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     make_record("sensor_nonlinearity", 1, path, visible=(2.0, 2.5))
     record = read_record(path).slice(0, 3000)
-    found = diagnose([record], effects=[EFFECTS[n] for n in BENDS])
-    assert found.verdict == "ambiguous"
-    (cause,) = found.causes
+    result = diagnose([record], effects=[EFFECTS[n] for n in BENDS])
+    assert result.verdict == "ambiguous"
+    (cause,) = result.causes
     assert {cause.effect, *cause.cannot_be_told_from} == set(BENDS)
     one, other = (f.probability for f in cause.families)
     assert cause.confidence == pytest.approx(one, rel=1e-3)
     assert one == pytest.approx(other, rel=1e-3)
-    assert "no voltage below the resonances tells" in found.next_experiment.why
-    told, _ = one_of_each(found.contenders, found.experiments)
-    assert len(told) == 1
+    assert "no voltage below the resonances tells" in result.next_experiment.why
+    output, _ = one_of_each(result.contenders, result.experiments)
+    assert len(output) == 1
     with pytest.raises(InputError, match="bend the same curve"):
-        resolving_experiment(found)
-    assert files.with_next(found, tmp_path / "next.csv", lambda _: None) is found
+        resolving_experiment(result)
+    assert files.with_next(result, tmp_path / "next.csv", lambda _: None) is result

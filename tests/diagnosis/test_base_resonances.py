@@ -38,10 +38,10 @@ def _quietly(_: str) -> None:
 def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) -> None:
     """From the linear part's starts alone this fit ended at 1.16 times the noise."""
     truth, experiments, base = _fitted(tmp_path / "a.csv", "fast", 1)
-    found = from_resonances(base, experiments, _quietly)
-    assert found is not None
-    assert found.rms < 1.02 * truth.sigma
-    stack, p = truth.stack, found.model.values
+    fit = from_resonances(base, experiments, _quietly)
+    assert fit is not None
+    assert fit.rms < 1.02 * truth.sigma
+    stack, p = truth.stack, fit.model.values
     tones = sorted([np.sqrt(stack.k_p / stack.m_p), np.sqrt(stack.k_b / stack.m_b)])
     mine = sorted([np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])])
     assert mine[0] == pytest.approx(tones[0], rel=0.1)
@@ -51,8 +51,8 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
 def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
     """1.69 kHz sampled at 2 kHz, seen at 0.33 kHz, where it decays as fast in time."""
     make_record(None, 19, tmp_path / "a.csv", excitation="short")
-    found = diagnose([read_record(tmp_path / "a.csv")], effects=[EFFECTS["structural_mode"]])
-    assert found.verdict == "adequate"
+    result = diagnose([read_record(tmp_path / "a.csv")], effects=[EFFECTS["structural_mode"]])
+    assert result.verdict == "adequate"
 
 
 @slow

@@ -55,10 +55,10 @@ def shown_up_to(record: Record, share: float) -> Record:
 def test_a_record_that_hides_nearly_all_names_no_cause(
     share: float, effect: str, told: str, triangle: Record
 ) -> None:
-    found = diagnose([shown_up_to(triangle, share)], effects=[EFFECTS[effect]])
-    assert found.causes == ()
-    assert told in found.doubt
-    assert found.doubt in " ".join(story(found).split())
+    result = diagnose([shown_up_to(triangle, share)], effects=[EFFECTS[effect]])
+    assert result.causes == ()
+    assert told in result.doubt
+    assert result.doubt in " ".join(story(result).split())
 
 
 @pytest.mark.parametrize("share", [0.12, 0.15, 0.2, 0.5])
@@ -74,8 +74,8 @@ def test_a_window_of_the_motion_is_no_integral(triangle: Record) -> None:
     """Within it, the voltage of rises is higher than that of falls: it follows the rate."""
     y = triangle.displacement
     assert y is not None
-    seen = np.abs(y - y.min() - 0.5 * np.ptp(y)) < 0.03 * np.ptp(y)
-    assert not doubtful_quantity([replace(triangle, displacement=np.where(seen, y, np.nan))])
+    observed = np.abs(y - y.min() - 0.5 * np.ptp(y)) < 0.03 * np.ptp(y)
+    assert not doubtful_quantity([replace(triangle, displacement=np.where(observed, y, np.nan))])
 
 
 def held(record: Record, count: int) -> tuple[Experiment, ...]:
@@ -106,10 +106,10 @@ def test_what_held_out_samples_confirm(
 ) -> None:
     experiments = held(triangle, count)
     gain = Gain(40.0, interval)
-    said = unconfirmed(
+    note = unconfirmed(
         experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden, limits=LIMITS
     )
-    assert told in str(said)
-    assert (said is not None) == bool(told)
+    assert told in str(note)
+    assert (note is not None) == bool(told)
     few = [n for n in coverage_notes(experiments) if n.code == "held_out_says_little"]
     assert len(few) == (count < 16)

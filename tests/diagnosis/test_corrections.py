@@ -28,8 +28,8 @@ NOISE = 2e-9
 
 def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
     experiments = (split(Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
-    found = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
-    return found, experiments, Colour((np.zeros(0),), NOISE, (len(found.residuals),))
+    result = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
+    return result, experiments, Colour((np.zeros(0),), NOISE, (len(result.residuals),))
 
 
 def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
@@ -49,11 +49,11 @@ def _measured(clean: FloatArray, added: FloatArray) -> FloatArray:
 
 
 def _play(v: FloatArray, radius: float) -> FloatArray:
-    found, state = np.empty_like(v), float(v[0])
+    values, state = np.empty_like(v), float(v[0])
     for k, value in enumerate(v.tolist()):
         state = min(max(state, value - radius), value + radius)
-        found[k] = state
-    return found
+        values[k] = state
+    return values
 
 
 def _relaxed(x: FloatArray, tau: float) -> FloatArray:
@@ -78,10 +78,10 @@ HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
 @pytest.mark.parametrize("hidden", HIDDEN)
 def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> None:
     y = _measured(clean, HIDDEN[hidden](clean))
-    found, experiments, colour = _fitted(y)
-    seen = corrections(found, experiments, colour)
-    base = (np.asarray(found.predicted(experiments)[0]),)
-    patch = best_of(seen, experiments, [_held(found, experiments)], colour)
+    result, experiments, colour = _fitted(y)
+    observed = corrections(result, experiments, colour)
+    base = (np.asarray(result.predicted(experiments)[0]),)
+    patch = best_of(observed, experiments, [_held(result, experiments)], colour)
     assert patch is not None
     assert hidden in (patch.name, *patch.open_to)
     removed = removed_from(experiments, base, [NOISE])
@@ -94,15 +94,15 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
 @pytest.mark.parametrize("hidden", slow_but(["memory at the force"], HIDDEN))
 def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatArray) -> None:
     """In the model it does what the linear estimate promises; the file reads back the same."""
-    found, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))
-    predicted = found.predicted(experiments)
+    result, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))
+    predicted = result.predicted(experiments)
     held = held_out_rms(experiments, predicted)
     kind, port = hidden.split(" at the ")
-    seen = [c for c in corrections(found, experiments, colour) if c.kind == kind]
-    seen = [c for c in seen if c.port == port]
-    patch = best_of(seen, experiments, [held], colour)
+    items = [c for c in corrections(result, experiments, colour) if c.kind == kind]
+    items = [c for c in items if c.port == port]
+    patch = best_of(items, experiments, [held], colour)
     assert isinstance(patch, Patch)
-    again = with_patch(found, patch, experiments, predicted)
+    again = with_patch(result, patch, experiments, predicted)
     after = held_out_rms(experiments, again.predicted(experiments))
     assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
     model = loads(dumps(again.model))
@@ -112,20 +112,20 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
 
 
 def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
-    found, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
-    modes = [c for c in corrections(found, experiments, colour) if c.kind == "modes"]
+    result, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
+    modes = [c for c in corrections(result, experiments, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
     with pytest.raises(InputError, match="no form that a model could hold"):
-        with_patch(found, patch, experiments, found.predicted(experiments))
+        with_patch(result, patch, experiments, result.predicted(experiments))
 
 
 def test_noise_gets_no_correction(clean: FloatArray) -> None:
     noise = NOISE * np.random.default_rng(3).standard_normal(TIME.size)
-    found, experiments, colour = _fitted(clean + noise)
-    seen = corrections(found, experiments, colour)
-    assert max(c.evidence for c in seen) < 3.0
-    assert best_of(seen, experiments, [_held(found, experiments)], colour) is None
+    result, experiments, colour = _fitted(clean + noise)
+    observed = corrections(result, experiments, colour)
+    assert max(c.evidence for c in observed) < 3.0
+    assert best_of(observed, experiments, [_held(result, experiments)], colour) is None
 
 
 def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
@@ -143,8 +143,8 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
     without = [("one", (truth + one,)), ("other", (truth + other,))]
     base, extended = (truth + one + other,), (truth,)
-    found = budget(removed_from(experiments, base, [NOISE]), extended, without, None)
-    spent = stack_budget(found, experiments, base, extended, NOISE)
+    result = budget(removed_from(experiments, base, [NOISE]), extended, without, None)
+    spent = stack_budget(result, experiments, base, extended, NOISE)
     assert spent.excess_rms_m == pytest.approx(5.0 * NOISE, rel=0.05)
     assert [s.share for s in spent.causes] == pytest.approx([9 / 25, 16 / 25], abs=0.04)
     assert spent.together.share == pytest.approx(1.0, abs=0.02)

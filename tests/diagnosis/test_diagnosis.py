@@ -73,7 +73,7 @@ def test_a_single_slow_triangle_is_said_to_be_blind_to_fast_effects(
     voltage = 40 * (1 - np.abs(1 - (time / 15) % 2))
     slow = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
     noisy = slow + truth.sigma * np.random.default_rng(0).standard_normal(len(slow))
-    found = psa.diagnose([Record(name="slow", time=time, voltage=voltage, displacement=noisy)])
+    result = psa.diagnose([Record(name="slow", time=time, voltage=voltage, displacement=noisy)])
     assert record.n > 0
-    assert "sensor_delay" in {b.effect for b in found.blind_to}
-    assert found.verdict in ("adequate", "ambiguous")
+    assert "sensor_delay" in {b.effect for b in result.blind_to}
+    assert result.verdict in ("adequate", "ambiguous")

@@ -35,8 +35,8 @@ TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
 @pytest.fixture(scope="module")
 def shown() -> FloatArray:
     """What a stack does, with a little noise."""
-    found = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
-    return found + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
+    result = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
+    return result + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
 def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.StackDiagnosis:
@@ -52,27 +52,27 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
         "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
         "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
     }[kind]
-    found = _told(y)
-    assert found.verdict == "not_driven"
-    assert not found.causes
-    assert "same device" in found.notes[-1]
-    assert "does not follow the voltage" in story(found)
+    result = _told(y)
+    assert result.verdict == "not_driven"
+    assert not result.causes
+    assert "same device" in result.notes[-1]
+    assert "does not follow the voltage" in story(result)
 
 
 def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
-    found = _told(-shown)
-    assert found.verdict == "not_driven"
+    result = _told(-shown)
+    assert result.verdict == "not_driven"
     assert (
-        "the sign of the displacement flipped the base model explains 100.00 %" in found.notes[-1]
+        "the sign of the displacement flipped the base model explains 100.00 %" in result.notes[-1]
     )
-    assert "falls while the voltage rises" in verdict_sentence(found)
+    assert "falls while the voltage rises" in verdict_sentence(result)
 
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
 def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
-    found = _told(factor * shown)
-    assert found.verdict == "adequate"
-    assert "its unit, or that of the voltage, is probably another" in found.notes[-1]
+    result = _told(factor * shown)
+    assert result.verdict == "adequate"
+    assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
 
 
 def _modes() -> Record:
@@ -99,10 +99,10 @@ def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with
 
 @slow
 def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
-    found = psa.diagnose([_modes()], effects=TABLE)
-    assert found.verdict == "unexplained"
-    assert any("A linear filter of the voltage explains" in n for n in found.notes)
-    assert not any("of the same device" in n for n in found.notes)
+    result = psa.diagnose([_modes()], effects=TABLE)
+    assert result.verdict == "unexplained"
+    assert any("A linear filter of the voltage explains" in n for n in result.notes)
+    assert not any("of the same device" in n for n in result.notes)
 
 
 def test_what_no_fit_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
@@ -122,8 +122,8 @@ def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArra
     moves = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown)
     rest = np.ones(TIME.size)
     hold = replace(moves, name="hold", voltage=VOLTAGE[0] * rest, displacement=shown[0] * rest)
-    found = psa.diagnose([moves, hold], effects=TABLE)
-    assert np.isfinite(found.base_errors.holdout_nrmse_percent)
+    result = psa.diagnose([moves, hold], effects=TABLE)
+    assert np.isfinite(result.base_errors.holdout_nrmse_percent)
 
 
 #: The effects that come nearest to the curve, and one that does not.
@@ -147,15 +147,15 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
     )
     paths = {n: tmp_path / n for n in ("ext.json", "patched.json", "d.json", "r.html")}
     left_out = (word for n in EFFECTS if n not in NEAR for word in ("--leave-out", n))
-    said = done(
+    statement = done(
         "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
         "--json", paths["d.json"], "--report", paths["r.html"], "--still", *left_out,
     ).out  # fmt: skip
-    told = json.loads(paths["d.json"].read_text(encoding="utf-8"))
-    assert told["verdict"] == "unexplained"
-    assert (told["patch"]["kind"], told["patch"]["port"]) == ("curve", "reading")
-    assert told["budget"]["unnamed"]["share"] > 0.9
-    assert "unnamed correction would remove" in " ".join(said.split())
+    content = json.loads(paths["d.json"].read_text(encoding="utf-8"))
+    assert content["verdict"] == "unexplained"
+    assert (content["patch"]["kind"], content["patch"]["port"]) == ("curve", "reading")
+    assert content["budget"]["unnamed"]["share"] > 0.9
+    assert "unnamed correction would remove" in " ".join(statement.split())
     page = paths["r.html"].read_text(encoding="utf-8")
     assert "Where the error goes" in page
     assert "Unnamed correction: curve at the reading" in page
@@ -168,6 +168,6 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
 
 
 def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
-    said = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
-    assert "No unnamed correction" in said
+    text = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
+    assert "No unnamed correction" in text
     assert not (tmp_path / "p.json").exists()

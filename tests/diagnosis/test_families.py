@@ -50,11 +50,11 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
     same = _patch("relaxation", "force", 1100.0)
     other = _patch("curve", "drive voltage", 1080.0)
     weak = _patch("time", "reading", 5.0)
-    shown = Shown(1000.0, FEW)
-    found = families({"slow_creep": 1.0}, PLACES, shown, [same, other, weak], LIMITS)
-    shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in found}
+    displayed = Shown(1000.0, FEW)
+    result = families({"slow_creep": 1.0}, PLACES, displayed, [same, other, weak], LIMITS)
+    shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in result}
     odds = float(np.exp(-1.0))
-    tried = shown.known(LIMITS)
+    tried = displayed.known(LIMITS)
     assert shares[CREEP] == pytest.approx((tried / (1.0 + odds), 0.0), abs=1e-4)
     assert shares["drive", "curve"] == pytest.approx((tried * odds / (1.0 + odds),) * 2, rel=1e-4)
     assert len(shares) == 2
@@ -72,12 +72,12 @@ def test_one_of_its_kind_that_explains_much_more_leaves_the_form_open() -> None:
 def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
     """A quarter less evidence are odds of exp(1/2): without the cause they tell little of it."""
     rows = [_patch("memory", "force", 400.0), _patch("curve", "reading", 300.0)]
-    shown = Shown(400.0, FEW)
-    first, second = families({}, {}, shown, rows, LIMITS)
+    displayed = Shown(400.0, FEW)
+    first, second = families({}, {}, displayed, rows, LIMITS)
     assert (first.place, first.kind) == ("plant", "hysteresis")
     assert (second.place, second.kind) == ("sensor", "curve")
     assert first.not_listed / second.not_listed == pytest.approx(np.exp(0.5))
-    assert first.not_listed + second.not_listed == pytest.approx(shown.known(LIMITS))
+    assert first.not_listed + second.not_listed == pytest.approx(displayed.known(LIMITS))
 
 
 def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_thought_of() -> None:
@@ -92,10 +92,10 @@ def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_though
 def test_the_sentence_names_what_no_effect_is_and_what_was_not_tried() -> None:
     chances, weak = {"slow_creep": 1.0}, Shown(100.0, 4000)
     rival = _patch("curve", "reading", 98.0)
-    told = family_sentence(families(chances, PLACES, weak, [rival], LIMITS))
-    assert "a relaxation in the stack" in told
-    assert "none of the listed effects" in told
-    assert told.endswith("or something that was not tried (20 %)")
+    text = family_sentence(families(chances, PLACES, weak, [rival], LIMITS))
+    assert "a relaxation in the stack" in text
+    assert "none of the listed effects" in text
+    assert text.endswith("or something that was not tried (20 %)")
     assert not family_sentence(())
 
 
@@ -103,7 +103,7 @@ def test_the_sentence_names_what_no_effect_is_and_what_was_not_tried() -> None:
 def test_a_foreign_effect_has_a_place_and_a_kind_or_no_name(tmp_path: Path) -> None:
     """The gauge changes its range at one displacement: no effect of the table does that alone."""
     make_record("range_switch", 990030, tmp_path / "r.csv", visible=(0.3, 3.0))
-    found = psa.diagnose(tmp_path / "r.csv")
-    assert all(c.confidence < 0.9 or c.families[0].kind == "curve" for c in found.causes)
-    if not found.causes:
-        assert found.families[0].place == "sensor"
+    result = psa.diagnose(tmp_path / "r.csv")
+    assert all(c.confidence < 0.9 or c.families[0].kind == "curve" for c in result.causes)
+    if not result.causes:
+        assert result.families[0].place == "sensor"

@@ -39,10 +39,10 @@ def without(record: Record, *ranges: tuple[int, int]) -> Record:
 
 def test_what_happened_in_a_gap_is_no_cause(whole: Record) -> None:
     record = without(whole, (300, 500))
-    found = diagnose([record], effects=[EFFECTS["rate_dependent_hysteresis"]])
-    assert found.verdict == "adequate"
-    assert {e.record.name for e in found.experiments} == {"r[0:300]", "r[300:700]"}
-    assert "r: no sample for 1.005 s from 1.495 s on, while the voltage moves" in found.notes[-1]
+    result = diagnose([record], effects=[EFFECTS["rate_dependent_hysteresis"]])
+    assert result.verdict == "adequate"
+    assert {e.record.name for e in result.experiments} == {"r[0:300]", "r[300:700]"}
+    assert "r: no sample for 1.005 s from 1.495 s on, while the voltage moves" in result.notes[-1]
 
 
 def record(time: FloatArray, voltage: FloatArray) -> Record:
@@ -66,6 +66,6 @@ NO_GAP: dict[str, Record] = {
 @pytest.mark.parametrize("case", NO_GAP)
 def test_what_is_no_gap(case: str) -> None:
     assert gaps(NO_GAP[case]) == ()
-    parts, said = without_gaps([NO_GAP[case]])
+    parts, statement = without_gaps([NO_GAP[case]])
     assert parts == [NO_GAP[case]]
-    assert not said
+    assert not statement

@@ -48,13 +48,13 @@ def _own(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnCo
 
 def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
     """What is said of an error (n,) [m] of that model."""
-    found, voltage, clean = fitted
+    result, voltage, clean = fitted
     experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
     used = error[experiments[0].used]
-    seen = replace(found, residuals=used)
+    observed = replace(result, residuals=used)
     colour = _own(experiments, [error])
     noise = noise_floor([experiments[0].record], [error])
-    return held_out_excess(seen, experiments, (clean,), colour, noise, LIMITS).factor
+    return held_out_excess(observed, experiments, (clean,), colour, noise, LIMITS).factor
 
 
 @slow
@@ -87,9 +87,9 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
 ) -> None:
     """Its offset is found in a tenth of it; its noise is three times that of the fitted one."""
-    found, voltage, clean = fitted
+    result, voltage, clean = fitted
     rng = np.random.default_rng(3)
-    told = []
+    items = []
     for _ in range(25):
         draws = LEVEL * rng.standard_normal((2, SAMPLES)) * np.array([[1.0], [3.0]])
         errors = lfilter([1.0], [1.0, -correlation], draws, axis=1)
@@ -101,13 +101,15 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         lead = experiments[1].known
         offset = float(np.mean(errors[1][:samples][lead]))
         sigma = tuple(float(np.std(e)) for e in errors)
-        seen = replace(found, residuals=errors[0], sigma=sigma)
+        observed = replace(result, residuals=errors[0], sigma=sigma)
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
         colour = _own(experiments, left)
-        told.append(held_out_excess(seen, experiments, predicted, colour, noise, LIMITS).factor)
-    assert told == [1.0] * 25
+        items.append(
+            held_out_excess(observed, experiments, predicted, colour, noise, LIMITS).factor
+        )
+    assert items == [1.0] * 25
 
 
 @slow

@@ -36,9 +36,9 @@ def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     make_record("drive_lag", 52001, path, gain=9.171e-4)
     record = read_record(path)
     names = ("rate_dependent_hysteresis", "voltage_saturation", "preload_loss", "load_stiffness")
-    found = diagnose([record], effects=[EFFECTS[n] for n in (*names, "drive_lag")])
-    assert found.verdict == "cause_named"
-    assert [c.effect for c in found.causes] == ["drive_lag"]
+    result = diagnose([record], effects=[EFFECTS[n] for n in (*names, "drive_lag")])
+    assert result.verdict == "cause_named"
+    assert [c.effect for c in result.causes] == ["drive_lag"]
 
 
 @slow
@@ -47,9 +47,9 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
 ) -> None:
     """Seven standard deviations of the noise off, two of what a hum leaves of the base fit."""
     truth = make_record("mains_hum", 3, tmp_path / "a.csv", excitation="triangle", visible=3.0)
-    given = read_record(tmp_path / "a.csv").slice(0, 1200)
+    inputs = read_record(tmp_path / "a.csv").slice(0, 1200)
     counts = 0.7 * truth.sigma
-    y = counts * np.round(measured(given) / counts)
+    y = counts * np.round(measured(inputs) / counts)
     moves = np.abs(np.diff(truth.displacement[:1200], prepend=0.0))
     stuck = []
     for k in range(100, 1100, 50):
@@ -58,10 +58,10 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
             y[k : k + length] = y[k - 1]
             stuck.append(k + length - 1)
     assert len(stuck) > 10
-    record = Record(name="a", time=given.time, voltage=given.voltage, displacement=y)
-    found = diagnose([record], effects=[EFFECTS["mains_hum"]])
-    used = found.experiments[0].record.mask
-    assert [c.effect for c in found.causes] == ["mains_hum"]
+    record = Record(name="a", time=inputs.time, voltage=inputs.voltage, displacement=y)
+    result = diagnose([record], effects=[EFFECTS["mains_hum"]])
+    used = result.experiments[0].record.mask
+    assert [c.effect for c in result.causes] == ["mains_hum"]
     assert np.mean(used[stuck]) < 0.4
     assert np.mean(used) > 0.95
-    assert any("repeat the last one far from the model" in n for n in found.notes)
+    assert any("repeat the last one far from the model" in n for n in result.notes)

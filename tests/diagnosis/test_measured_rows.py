@@ -28,9 +28,9 @@ def rows() -> dict[str, list[str]]:
 
 def percents(cell: str) -> tuple[float, float]:
     """Smallest and largest figure of a cell."""
-    found = re.match(r"([0-9.]+)(?: to ([0-9.]+))? %", cell)
-    assert found is not None, cell
-    return float(found[1]), float(found[2] or found[1])
+    result = re.match(r"([0-9.]+)(?: to ([0-9.]+))? %", cell)
+    assert result is not None, cell
+    return float(result[1]), float(result[2] or result[1])
 
 
 def within(value: float, cell: str) -> bool:
@@ -40,12 +40,12 @@ def within(value: float, cell: str) -> bool:
 
 def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
     """Hold a diagnosis, as its JSON has it, against a row of the page."""
-    base, extended, said = rows()[given]
-    assert said.startswith(f"`{d['verdict']}`")
+    base, extended, statement = rows()[given]
+    assert statement.startswith(f"`{d['verdict']}`")
     named = {n for c in d["causes"] for n in (c["effect"], *c["cannot_be_told_from"])}
-    written = set(re.findall(r"`([a-z_]+)`", said)) & set(EFFECTS)
+    written = set(re.findall(r"`([a-z_]+)`", statement)) & set(EFFECTS)
     assert written <= named
-    if "third effect" not in said:
+    if "third effect" not in statement:
         assert {c["effect"] for c in d["causes"]} <= written
     assert not named & {b["effect"] for b in d["blind_to"]}
     withdrawn = [n for n in d["notes"] if "not named, because" in n]
@@ -58,9 +58,9 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
 @pytest.mark.slow
 def test_the_record_of_the_readme_s_picture_gives_its_row(measured_data: Path) -> None:
     record = read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
-    told = json.loads(diagnose([record]).to_json())
-    is_what_the_row_says(told, "`sine_1hz.csv`")
-    assert told["budget"]["together"]["share"] > 0.95
+    content = json.loads(diagnose([record]).to_json())
+    is_what_the_row_says(content, "`sine_1hz.csv`")
+    assert content["budget"]["together"]["share"] > 0.95
 
 
 @pytest.mark.slow
@@ -69,5 +69,5 @@ def test_the_commands_of_the_readme_give_the_row_of_their_record(tmp_path: Path)
     block = block_in_tests("README.md")
     assert any("records/minor_loops.csv" in command for command in block.commands)
     assert run_block(block, tmp_path) is None
-    told = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
-    is_what_the_row_says(told, "`minor_loops.csv`")
+    content = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
+    is_what_the_row_says(content, "`minor_loops.csv`")

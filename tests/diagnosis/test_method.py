@@ -33,15 +33,15 @@ def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
     whole = [_found(n, (n,)) for n in NAMES]
     whole.append(replace(_found("dry_friction", (), "foreign", 9), patched=0.75))
     worse = [replace(f, named=("backlash",), within=("backlash",)) for f in whole[:3]]
-    asked: list[Method] = []
+    methods: list[Method] = []
 
     def diagnosed(_: Sequence[Case], method: Method) -> list[Found]:
-        asked.append(method)
+        methods.append(method)
         return [*worse, whole[3]] if "finite steps" in method.without else whole
 
     table = ablation_table("", without_steps(), whole, diagnosed).table
     rows = {row[0]: row[1:] for row in table.rows}
-    assert asked == [Method(frozenset({step})) for step in STEPS]
+    assert methods == [Method(frozenset({step})) for step in STEPS]
     right = ("3 of 3", "3 of 3", "0 of 4", "0 of 0", "75 % of 1", "1.0")
     assert rows["the method"] == (*right, "")
     for step in STEPS:
@@ -67,29 +67,29 @@ def test_a_diagnosis_decides_by_the_constants_that_it_is_given() -> None:
     drift = 0.05 * np.ptp(clean) * time / time[-1]
     record = psa.Record(name="r", time=time, voltage=voltage, displacement=clean + drift + noise)
     effects = [psa.EFFECTS[n] for n in ("offset_drift", "sensor_nonlinearity", "load_stiffness")]
-    own, kept = Method(thresholds=Thresholds()), vars(LIMITS).copy()
+    item, kept = Method(thresholds=Thresholds()), vars(LIMITS).copy()
     try:
         vars(LIMITS).clear()
         vars(LIMITS).update(dict.fromkeys(kept))
-        found = psa.diagnose([record], effects=effects, method=own)
+        result = psa.diagnose([record], effects=effects, method=item)
     finally:
         vars(LIMITS).update(kept)
-    assert [c.effect for c in found.causes] == ["offset_drift"]
-    strict = Method(thresholds=replace(own.thresholds, price=1e6))
+    assert [c.effect for c in result.causes] == ["offset_drift"]
+    strict = Method(thresholds=replace(item.thresholds, price=1e6))
     assert not psa.diagnose([record], effects=effects, method=strict).causes
 
 
 def test_a_spent_budget_ends_the_search_and_says_what_was_left() -> None:
     """The first visit is made; what was done and left is the same on one core and on two."""
     record = psa.read_record(str(resources.files("psa_casadi") / "data" / "demo.csv"))
-    said = []
+    items = []
     for count in ("1", "2"):
         with pytest.MonkeyPatch.context() as patch:
             patch.setenv("PSA_CASADI_THREADS", count)
-            found = diagnose([record], method=Method(budget=1.0))
-        assert [c.effect for c in found.causes] == ["slow_creep"]
-        said += [n for n in found.remarks if isinstance(n, Note) and n.code == "budget"]
-    assert len(said) == 2
-    assert said[0].values == said[1].values
-    assert {"neighbours", "finalists"} <= {*said[0].values["left"]}
-    assert "Not tried: " in str(said[0])
+            result = diagnose([record], method=Method(budget=1.0))
+        assert [c.effect for c in result.causes] == ["slow_creep"]
+        items += [n for n in result.remarks if isinstance(n, Note) and n.code == "budget"]
+    assert len(items) == 2
+    assert items[0].values == items[1].values
+    assert {"neighbours", "finalists"} <= {*items[0].values["left"]}
+    assert "Not tried: " in str(items[0])

@@ -51,9 +51,9 @@ def shares(m: Misfit) -> dict[str, float]:
 def test_a_function_of_the_voltage() -> None:
     error = 3e-8 * np.sin(2 * np.pi * SINE / 100.0)
     m = seen(SINE, error)
-    found = shares(m)
-    assert found["voltage"] > 0.97
-    assert max(found[name] for name in ("time", "rate", "amplitude", "frequency")) == 0.0
+    result = shares(m)
+    assert result["voltage"] > 0.97
+    assert max(result[name] for name in ("time", "rate", "amplitude", "frequency")) == 0.0
     assert m.sentences[1].startswith("The residual follows the voltage: ")
     view = next(v for v in m.views if v.name == "voltage")
     truth = 3e-8 * np.sin(2 * np.pi * view.x / 100.0)
@@ -83,9 +83,9 @@ def test_the_error_after_a_reversal() -> None:
     triangle = excitation.triangle(TIME, 0.0, 100.0, 1.0)
     since = np.mod(TIME, 0.5)
     m = seen(triangle, 5e-8 * np.exp(-since / 0.02))
-    found = shares(m)
-    assert found["since_reversal"] > 0.9
-    assert found["since_reversal"] == max(found.values())
+    result = shares(m)
+    assert result["since_reversal"] > 0.9
+    assert result["since_reversal"] == max(result.values())
 
 
 #: Sines of three amplitudes [V] at three frequencies each.
@@ -107,9 +107,9 @@ def test_amplitude_and_frequency_of_the_drive() -> None:
 
 def test_delay_grows_with_frequency_and_gain_with_amplitude() -> None:
     delayed = seen(SINES, -4e-11 * np.gradient(SINES, STEP))
-    found = shares(delayed)
-    assert found["frequency_lag"] > 0.3
-    assert found["frequency_gain"] == found["frequency"] == 0.0
+    result = shares(delayed)
+    assert result["frequency_lag"] > 0.3
+    assert result["frequency_gain"] == result["frequency"] == 0.0
     view = next(w for w in delayed.views if w.name == "frequency_lag")
     assert np.all(np.diff(view.mean[[0, -1]]) < -5e-9)
     grown = 1e-9 * (SINES - 0.5 * AMPLITUDE) * (AMPLITUDE - 60.0)
@@ -137,11 +137,11 @@ def test_white_noise_shows_nothing(voltage: FloatArray, seed: int) -> None:
 
 
 def test_coloured_noise_says_something_false_in_one_of_forty_records_at_most() -> None:
-    told = 0
+    output = 0
     for seed in range(40):
         voltage = (SINE, MULTISINE, STEPS)[seed % 3][:8_000]
-        told += len(seen(voltage, 0.0 * voltage, correlation=0.7, seed=seed).sentences) > 1
-    assert told <= 1
+        output += len(seen(voltage, 0.0 * voltage, correlation=0.7, seed=seed).sentences) > 1
+    assert output <= 1
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
@@ -222,8 +222,8 @@ def test_the_spectrum_of_noise_lies_on_its_floor() -> None:
 def test_even_and_odd_nonlinearity_of_a_sine() -> None:
     w = 4 * np.pi * TIME
     error: FloatArray = 1.5e-8 * np.sin(w) + 2e-8 * np.cos(2 * w) + 1e-8 * np.sin(3 * w + 0.4)
-    found = seen(SINE, error)
-    split = found.split
+    result = seen(SINE, error)
+    split = result.split
     assert split is not None
     assert split.fundamental == pytest.approx(2.0, rel=1e-6)
     assert split.excited == 1
@@ -231,7 +231,7 @@ def test_even_and_odd_nonlinearity_of_a_sine() -> None:
     assert split.even == pytest.approx(2e-8**2 / 2, rel=0.05)
     assert split.odd == pytest.approx(1e-8**2 / 2, rel=0.1)
     assert split.noise == pytest.approx(NOISE**2, rel=0.05)
-    assert "even nonlinearity (14 nm rms)" in found.sentences[-1]
+    assert "even nonlinearity (14 nm rms)" in result.sentences[-1]
 
 
 def test_a_multisine_of_odd_lines_shows_its_nonlinearity_between_them() -> None:

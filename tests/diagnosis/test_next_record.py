@@ -34,25 +34,25 @@ HELD = [(29.0, 60.0), (40.0, 60.0)]
 def test_what_is_lacking_is_asked_for_and_nothing_else(
     knots: list[tuple[float, float]], lacks: list[str]
 ) -> None:
-    said = str(useful_records([_record(knots)]))
+    statement = str(useful_records([_record(knots)]))
     words = ["a hold", "three rates", "three amplitudes", "repeats"]
-    assert said.startswith("Record what these records lack: ")
-    assert [w for w in words if w in said] == lacks
+    assert statement.startswith("Record what these records lack: ")
+    assert [w for w in words if w in statement] == lacks
 
 
 def test_records_that_hold_all_of_it_lead_to_other_conditions() -> None:
-    said = str(useful_records([_record([*LOOP, *FAST, *SMALLER, *HELD])]))
-    assert said.startswith("These records hold what usually separates causes")
+    statement = str(useful_records([_record([*LOOP, *FAST, *SMALLER, *HELD])]))
+    assert statement.startswith("These records hold what usually separates causes")
     # several records count together
     parts = [_record([*LOOP, *FAST]), _record([*LOOP, *SMALLER]), _record([*LOOP, *HELD])]
-    assert str(useful_records(parts)) == said
+    assert str(useful_records(parts)) == statement
 
 
 def test_causes_that_bend_one_curve_ask_for_a_column_also_where_structure_remains() -> None:
     bends = ("load_stiffness", "sensor_nonlinearity")
     causes = [Cause("hysteresis_memory", "plant", 0.99, {}, (), 0.7),
               Cause(bends[0], "plant", 0.5, {}, bends[1:], 0.2)]  # fmt: skip
-    found = next_experiment(causes, "partly_explained", [bends], [_record(LOOP)], doubted=False)
-    assert found.separates == bends
-    assert "column displacement_2" in found.why
-    assert "Record what these records lack" in found.why
+    result = next_experiment(causes, "partly_explained", [bends], [_record(LOOP)], doubted=False)
+    assert result.separates == bends
+    assert "column displacement_2" in result.why
+    assert "Record what these records lack" in result.why

@@ -26,8 +26,8 @@ def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
     tone = np.sin(2.0 * np.pi * 157.0 * TIME)
     for misfit in (0.0 * TIME, triangle, steps, tone):
         for seed in range(4):
-            rms, found = first_order_noise(noise(0.0, seed) + misfit)
-            assert found == 0.0
+            rms, result = first_order_noise(noise(0.0, seed) + misfit)
+            assert result == 0.0
             assert rms == pytest.approx(1.0, rel=0.06)
 
 
@@ -37,13 +37,13 @@ def test_a_colour_survives_the_projection_of_slow_directions(correlation: float)
     n, rng = 3000, np.random.default_rng(6)
     waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, n), np.arange(100)))
     basis = np.linalg.qr(waves)[0]
-    found, plain = [], []
+    result, plain = [], []
     for _ in range(10):
         e = coloured(rng.standard_normal(n + 200), correlation)[200:]
         left = e - basis @ (basis.T @ e)
         plain.append(float(left[1:] @ left[:-1] / (left @ left)))
-        found.append(float(np.sum(colour_of(left, [n // 2] * 2, None, basis).autoregression[0])))
-    assert np.mean(found) == pytest.approx(correlation, abs=0.015)
+        result.append(float(np.sum(colour_of(left, [n // 2] * 2, None, basis).autoregression[0])))
+    assert np.mean(result) == pytest.approx(correlation, abs=0.015)
     assert np.mean(plain) < correlation - 0.03
     halves = list(np.split(basis, 2))
     assert left_correlation(correlation, halves) == pytest.approx(np.mean(plain), abs=0.015)
@@ -54,8 +54,8 @@ def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: flo
     rng = np.random.default_rng(8)
     drawn = [coloured(rng.standard_normal(n + 200), correlation)[200:] for _ in range(60)]
     powers = [first_order_noise(e)[0] ** 2 for e in drawn]  # capped by what the draw really has
-    said = float(np.median([uncertain(e) for e in drawn]))
-    assert 0.5 * said < float(np.std(powers)) < 1.5 * said
+    statement = float(np.median([uncertain(e) for e in drawn]))
+    assert 0.5 * statement < float(np.std(powers)) < 1.5 * statement
 
 
 def _size_test(
@@ -94,12 +94,12 @@ def _own(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95])
 def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
-    found = _own(noise(correlation), np.zeros((N, 0)), np.zeros(N))
-    assert found.runs == (1000, 3790)
-    assert found.level == pytest.approx(np.sqrt(1.0 - correlation**2), rel=0.04)
-    assert np.std(found.ahead) == pytest.approx(found.level, rel=0.06)
-    assert float(np.sum(found.autoregression)) == pytest.approx(correlation, abs=0.05)
-    assert found.colour.whiten(found.residuals).std() == pytest.approx(found.level, rel=0.02)
+    result = _own(noise(correlation), np.zeros((N, 0)), np.zeros(N))
+    assert result.runs == (1000, 3790)
+    assert result.level == pytest.approx(np.sqrt(1.0 - correlation**2), rel=0.04)
+    assert np.std(result.ahead) == pytest.approx(result.level, rel=0.06)
+    assert float(np.sum(result.autoregression)) == pytest.approx(correlation, abs=0.05)
+    assert result.colour.whiten(result.residuals).std() == pytest.approx(result.level, rel=0.02)
 
 
 def test_slow_waves_are_no_evidence_beside_a_random_walk() -> None:
@@ -117,10 +117,10 @@ def test_the_noise_of_a_clock_that_jitters_grows_with_the_rate() -> None:
     rng, rate = np.random.default_rng(5), np.abs(np.gradient(VOLTAGE))
     rate = rate / np.sqrt(np.mean(rate**2))
     error = rng.standard_normal(N) + 3.0 * rate * rng.standard_normal(N)
-    found = _own(error, np.zeros((N, 0)), rate)
-    assert found.spread is not None
-    assert found.nats() > _own(error, np.zeros((N, 0)), np.ones(N)).nats() + 300.0
-    white = found.colour.whiten(found.residuals)
+    result = _own(error, np.zeros((N, 0)), rate)
+    assert result.spread is not None
+    assert result.nats() > _own(error, np.zeros((N, 0)), np.ones(N)).nats() + 300.0
+    white = result.colour.whiten(result.residuals)
     fast = rate[np.r_[0:1000, 1010 : int(0.8 * N)]] > 1.0
     assert white[fast].std() == pytest.approx(white[~fast].std(), rel=0.08)
     even = [_own(noise(0.0, k), np.zeros((N, 0)), rate).spread for k in range(20)]

@@ -49,12 +49,12 @@ def test_noise_of_any_colour_is_noise(
     """Three times as large as the white noise beside it."""
     path, rng = tmp_path / "clean.csv", np.random.default_rng(number)
     make_record(None, 4430 + number, path)
-    time, voltage, shown = np.loadtxt(path, delimiter=",", skiprows=1).T
-    white = float(np.std(np.diff(shown, 3))) / np.sqrt(20.0)
+    time, voltage, displayed = np.loadtxt(path, delimiter=",", skiprows=1).T
+    white = float(np.std(np.diff(displayed, 3))) / np.sqrt(20.0)
     noisy = {
         "time [s]": time,
         "voltage [V]": voltage,
-        "displacement [um]": shown + 3.0 * white * made(shown, rng),
+        "displacement [um]": displayed + 3.0 * white * made(displayed, rng),
     }
-    found = psa.diagnose(noisy)
-    assert (found.verdict, found.causes) == ("adequate", ())
+    result = psa.diagnose(noisy)
+    assert (result.verdict, result.causes) == ("adequate", ())

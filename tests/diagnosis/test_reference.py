@@ -23,14 +23,17 @@ CREEPS, CLEAN = (next(r for r in RECORDS if r.name.startswith(name)) for name in
 
 def recorded(name: str, *, noise: int, gain: float = 1.0, sound: bool = False) -> psa.Record:
     """Return a record of the exam with noise anew; `sound` without what it hides."""
-    given = next(r for r in RECORDS if r.name.startswith(name))
-    played = play(replace(given, hidden={}) if sound else given)
-    sigma = 1e-2 * given.test.noise * float(np.ptp(played.clean))
-    shown = gain * played.clean + sigma * np.random.default_rng(noise).standard_normal(
+    inputs = next(r for r in RECORDS if r.name.startswith(name))
+    played = play(replace(inputs, hidden={}) if sound else inputs)
+    sigma = 1e-2 * inputs.test.noise * float(np.ptp(played.clean))
+    displayed = gain * played.clean + sigma * np.random.default_rng(noise).standard_normal(
         played.clean.size
     )
     return psa.Record(
-        name=f"{name} {noise}", time=played.times, voltage=played.voltage, displacement=1e-6 * shown
+        name=f"{name} {noise}",
+        time=played.times,
+        voltage=played.voltage,
+        displacement=1e-6 * displayed,
     )
 
 
@@ -57,10 +60,10 @@ def test_an_effect_is_named_beside_a_hysteresis_that_the_base_lacks() -> None:
 def test_nothing_has_changed_in_the_same_test_of_a_healthy_device(sound: psa.Record) -> None:
     d = psa.diagnose(recorded("c07", noise=2), reference=sound)
     assert d.verdict == "adequate"
-    said = codes(d)
-    assert "since_moved" not in said
+    notes = codes(d)
+    assert "since_moved" not in notes
     # the base lacks the hysteresis: what is taken off is far above the noise
-    assert said["since"].values["removed"][0] > 2.0 * d.noise_floor_rms_m
+    assert notes["since"].values["removed"][0] > 2.0 * d.noise_floor_rms_m
 
 
 def test_a_gain_that_has_changed_is_told_as_a_parameter() -> None:
@@ -81,16 +84,16 @@ def test_what_the_device_adds_is_predicted_where_the_voltage_is_another() -> Non
     for v in values:
         clean = psa.simulate(model, time, v).displacement
         adds.append(2e-7 * (np.cos(0.09 * v) + np.tanh(np.gradient(v, time) / 20.0)))
-        shown = clean + adds[-1] + 1e-8 * rng.standard_normal(time.size)
-        records.append(psa.Record(name="r", time=time, voltage=v, displacement=shown))
+        displayed = clean + adds[-1] + 1e-8 * rng.standard_normal(time.size)
+        records.append(psa.Record(name="r", time=time, voltage=v, displacement=displayed))
     experiments = (whole(records[0]),)
     held = fit(model, experiments, (), sigma=[1e-7])
     healthy = Healthy(held, experiments)
     (added,), places = healthy.adds(records[1:])
-    seen = healthy.shows(records[1])
+    observed = healthy.shows(records[1])
     assert places == 0
-    assert np.mean(seen) > 0.25
-    assert np.corrcoef(added[seen], adds[1][seen])[0, 1] > 0.9
+    assert np.mean(observed) > 0.25
+    assert np.corrcoef(added[observed], adds[1][observed])[0, 1] > 0.9
     (again,), places = healthy.adds(records[:1])
     assert places == 1
     assert np.corrcoef(again, adds[0])[0, 1] > 0.95

@@ -32,8 +32,10 @@ LOW, HIGH, RATE = -10.0, 90.0, 2000.0
 def stack(effect: str, covariance: Covariance | None = None, **values: float) -> Model:
     """Return a linear stack with an effect, as if identified from 30 s between -10 and 90 V."""
     model = compose((*BASE, EFFECTS[effect]), {**VALUES, **values})
-    seen = SeenRange(Interval(LOW, HIGH), RATE, 30.0)
-    return replace(model, evidence=Evidence("test", 0.0, seen, covariance or Covariance((), ())))
+    observed = SeenRange(Interval(LOW, HIGH), RATE, 30.0)
+    return replace(
+        model, evidence=Evidence("test", 0.0, observed, covariance or Covariance((), ()))
+    )
 
 
 def of(effect: str, model: Model) -> dict[tuple[str, float], Size]:
@@ -42,15 +44,15 @@ def of(effect: str, model: Model) -> dict[tuple[str, float], Size]:
 
 def test_creep_goes_on_by_the_sum_of_its_relaxations() -> None:
     model = stack("slow_creep", creep_gain=0.02, creep_time=0.5)
-    found = of("slow_creep", model)
+    result = of("slow_creep", model)
     step = 0.02  # a raised cosine of 20 ms: the mean of it is half of that late
     moved = PER_VOLT * (HIGH - LOW)
     for at in (10.0, 600.0):
         after = [
             np.exp(-step / 2 / tau) - np.exp(-(at + step / 2) / tau) for tau in (0.5, 5.0, 50.0)
         ]
-        assert found["hold", at].value == pytest.approx(0.02 * moved * sum(after), rel=1e-3)
-    assert [found["hold", at].beyond_records for at in (10.0, 600.0)] == [False, True]
+        assert result["hold", at].value == pytest.approx(0.02 * moved * sum(after), rel=1e-3)
+    assert [result["hold", at].beyond_records for at in (10.0, 600.0)] == [False, True]
 
 
 def test_play_sets_the_ways_apart_by_the_gap_and_a_delay_moves_by_rate_times_time() -> None:
@@ -65,12 +67,12 @@ def test_play_sets_the_ways_apart_by_the_gap_and_a_delay_moves_by_rate_times_tim
 
 def test_a_curve_bends_beside_zero_and_sensitivity() -> None:
     gain, rated = 0.1, compose(BASE, VALUES).values["u_rated"]
-    found = of("field_dependent_gain", stack("field_dependent_gain", field_gain=gain))
+    result = of("field_dependent_gain", stack("field_dependent_gain", field_gain=gain))
     u = np.linspace(LOW, HIGH, 2001)
     added = PER_VOLT * gain * u * np.abs(u) / rated
     bent = added - np.polyval(np.polyfit(u, added, 1), u)
-    assert found["range", HIGH].value == pytest.approx(np.max(np.abs(bent)), rel=0.01)
-    assert found["top", HIGH].value == pytest.approx(added[-1], rel=1e-3)
+    assert result["range", HIGH].value == pytest.approx(np.max(np.abs(bent)), rel=0.01)
+    assert result["top", HIGH].value == pytest.approx(added[-1], rel=1e-3)
 
 
 def test_a_mode_is_heard_at_its_frequency() -> None:
@@ -107,12 +109,12 @@ def test_a_size_is_as_certain_as_the_parameters_of_the_effect() -> None:
 @pytest.mark.parametrize("effect", [*EFFECTS.values(), MODAL_SERIES[2]], ids=lambda e: e.name)
 def test_every_effect_has_a_size_and_a_remedy_in_words(effect: Component) -> None:
     assert effect.remedy is not None
-    model, found = example(effect)
-    assert found
-    assert any(s.value for s in found) or effect.linear
-    page = " ".join(effect_page(effect, 400, (model, found)).split())
+    model, result = example(effect)
+    assert result
+    assert any(s.value for s in result) or effect.linear
+    page = " ".join(effect_page(effect, 400, (model, result)).split())
     assert f"on P-885.51 with {effect.gain} = " in page
-    assert size_text(found, handy_scale) in page
+    assert size_text(result, handy_scale) in page
     assert DO[effect.remedy.code] in page
     assert RECORDS[effect.remedy.test] in page
 

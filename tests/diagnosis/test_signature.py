@@ -36,24 +36,24 @@ TOLD = {
 
 @pytest.mark.parametrize("name", TOLD)
 def test_the_telling_coordinate_is_the_physical_one(name: str) -> None:
-    seen = signature(EFFECTS[name])
-    assert seen.telling.name in TOLD[name]
-    assert 0.5 < seen.telling.share <= 1.0
+    observed = signature(EFFECTS[name])
+    assert observed.telling.name in TOLD[name]
+    assert 0.5 < observed.telling.share <= 1.0
 
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_has_a_signature_of_a_telling_size(name: str) -> None:
-    seen = signature(EFFECTS[name])
-    d = seen.difference
+    observed = signature(EFFECTS[name])
+    d = observed.difference
     assert np.isfinite(d).all()
-    assert 1e-3 < np.std(d) / seen.stroke < 0.05
+    assert 1e-3 < np.std(d) / observed.stroke < 0.05
     # offset and slope of the base are fitted: what is left is orthogonal to both
-    for known in (np.ones_like(d), seen.base - np.mean(seen.base)):
+    for known in (np.ones_like(d), observed.base - np.mean(observed.base)):
         assert abs(d @ known) < 1e-6 * np.linalg.norm(d) * np.linalg.norm(known)
-    assert seen.telling.x.size == seen.telling.mean.size >= 3
-    assert seen.coordinate.shape == seen.counted.shape
+    assert observed.telling.x.size == observed.telling.mean.size >= 3
+    assert observed.coordinate.shape == observed.counted.shape
     low, high = EFFECTS[name].parameters[0].bounds
-    assert low <= seen.size <= high or seen.gain != EFFECTS[name].parameters[0].name
+    assert low <= observed.size <= high or observed.gain != EFFECTS[name].parameters[0].name
 
 
 def test_creep_grows_during_holds_and_hum_is_a_line_at_its_frequency() -> None:

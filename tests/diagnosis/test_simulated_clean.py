@@ -87,8 +87,8 @@ QUICK = (
     ids=lambda c: f"{c.stack} {c.voltage} {c.noise}",
 )
 def test_what_the_package_simulates_is_adequate(case: Case) -> None:
-    found = psa.diagnose([record_of(case)])
-    assert (found.verdict, found.causes) == ("adequate", ())
+    result = psa.diagnose([record_of(case)])
+    assert (result.verdict, result.causes) == ("adequate", ())
 
 
 @pytest.mark.parametrize("step", [1e-6, 1e-9, 1e-10])

@@ -111,15 +111,15 @@ def test_loop_width_follows_the_logarithm_of_rate(peak: float) -> None:
             RATE_DEPENDENT_HYSTERESIS, {"rate_gain": gain, "rate_onset": 1e-3}
         )
         t, voltage = triangle(frequency, peak)
-        found = driven(model, t, voltage)
-        u, x = found.x[-401:, 0], found.y[-401:, -1]
+        result = driven(model, t, voltage)
+        u, x = result.x[-401:, 0], result.y[-401:, -1]
         up = np.interp(peak / 2, u[:200], x[:200])
         down = np.interp(peak / 2, u[200:][::-1], x[200:][::-1])
         return float(down - up), float(np.ptp(x))
 
-    shown = {g: np.log([width_and_stroke(g, f) for f in rates]) for g in (0.0, 0.05, -0.05)}
+    table = {g: np.log([width_and_stroke(g, f) for f in rates]) for g in (0.0, 0.05, -0.05)}
     for gain in (0.05, -0.05):
-        width, reach = np.polyfit(np.log10(rates), shown[gain] - shown[0.0], 1)[0]
+        width, reach = np.polyfit(np.log10(rates), table[gain] - table[0.0], 1)[0]
         assert width == pytest.approx(gain, rel=0.1)
         assert -0.5 < reach / gain < -0.05
 
@@ -209,7 +209,7 @@ def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
     model = plain.with_values({"memory_gain": 1.0, "memory_threshold": 0.02, **values})
     t = np.linspace(0.0, 60.0, 6001)
     voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
-    shown = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
+    displayed = driven(model, t, voltage).y[:, -1] - driven(plain, t, voltage).y[:, -1]
     rated, expected = model.values["u_rated"], np.zeros_like(t)
     for i, ratio in enumerate((1.0, 2.5, 6.0, 15.0)):
         p = play(voltage, 0.02 * ratio * rated)
@@ -217,7 +217,7 @@ def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
             terms = np.cos(np.pi * np.arange(3) * (i + 0.5) / 4) * weights.get(name, (0.0,) * 3)
             expected += np.sum(terms) * (voltage**power - p**power) / rated ** (power - 1)
     expected *= model.values["k_L"] * static_compliance(model.values)
-    assert np.sqrt(np.mean((shown - expected) ** 2)) < 0.05 * np.ptp(expected)
+    assert np.sqrt(np.mean((displayed - expected) ** 2)) < 0.05 * np.ptp(expected)
 
 
 @pytest.mark.parametrize("peak", [30.0, 120.0])
@@ -226,11 +226,11 @@ def test_backlash_dwells_over_the_gap(peak: float) -> None:
     model = linear(BACKLASH, 1.0, backlash_width=0.01)
     w = 0.01 * stroke_scale(model.values)
     t, voltage = triangle(1.0, peak)
-    found = driven(model, t, voltage)
-    tip, shown = found.x[:, model.state_names.index("x")], found.y[:, -1]
+    result = driven(model, t, voltage)
+    tip, displayed = result.x[:, model.state_names.index("x")], result.y[:, -1]
     for first, sign in ((600, -1.0), (800, 1.0)):  # the last downward and the last upward branch
         moved = sign * (tip[first : first + 200] - tip[first])
-        through = sign * (shown[first : first + 200] - shown[first])
+        through = sign * (displayed[first : first + 200] - displayed[first])
         crossed = [float(np.interp(d * w, moved, through)) / w for d in (0.9, 2.0, 6.0)]
         assert crossed[0] < 0.01
         assert crossed[1] < 0.2
@@ -248,8 +248,8 @@ def test_self_heating_climbs_and_recovers() -> None:
     model = stack("P-885.51", **{**QUICK, "delta": 0.0, "gamma": 0.0}).with_effect(
         SELF_HEATING, {"heating_gain": 0.02, "heating_time": cooling}
     )
-    found = driven(model, t, voltage)
-    states = dict(zip(model.state_names, found.x.T, strict=True))
+    result = driven(model, t, voltage)
+    states = dict(zip(model.state_names, result.x.T, strict=True))
     p = model.values
     h, u, a = states["f_H"], states["u"], p["A"]
     share = p["beta"] * p["h_ref"] * p["u_rated"]  # what makes one unit of heat, times |A|
@@ -258,7 +258,7 @@ def test_self_heating_climbs_and_recovers() -> None:
     wanted = float(lost[:3000] @ fading) / share
     assert states["heat"][3000] == pytest.approx(wanted, rel=0.03)
     cold = driven(model.with_values({"heating_gain": 0.0}), t, voltage).y[:, -1]
-    excess = (found.y[3100:, -1] - cold[3100:]) / cold[3100:]
+    excess = (result.y[3100:, -1] - cold[3100:]) / cold[3100:]
     assert excess[0] == pytest.approx(0.02 * states["heat"][3100], rel=1e-3)
     rate = np.polyfit(t[3100:5000], np.log(excess[:1900]), 1)[0]
     assert -1.0 / rate == pytest.approx(cooling, rel=0.01)
@@ -320,10 +320,10 @@ def test_ordinary_size_shows_and_costs_little(effect: Component) -> None:
     grid = [{n: float(v)} for n, values in grids.items() for v in values]
     grid = [g for g in grid if any(g.values()) or not set(g) & set(effect.linear)]
     for values in grid or [{}]:
-        found = driven(ordinary(effect, **values), t, voltage)
-        change = np.abs(found.y[:, -1] - base.y[:, -1]).max() / np.ptp(base.y[:, -1])
+        result = driven(ordinary(effect, **values), t, voltage)
+        change = np.abs(result.y[:, -1] - base.y[:, -1]).max() / np.ptp(base.y[:, -1])
         assert 5e-4 < change < 0.1, values
-        assert effect.tone or found.steps <= 1.5 * base.steps, values
+        assert effect.tone or result.steps <= 1.5 * base.steps, values
 
 
 @pytest.mark.parametrize("effect", [e for e in PLANT if bounded(e)], ids=lambda e: e.name)
@@ -378,8 +378,8 @@ def _loops() -> dict[str, FloatArray]:
 
 
 def _with_spectrum(**values: Any) -> Model:
-    own = [COMPONENTS["memory_spectrum"] if c.name == "bouc_wen" else c for c in BASE]
-    return compose(own, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
+    items = [COMPONENTS["memory_spectrum"] if c.name == "bouc_wen" else c for c in BASE]
+    return compose(items, {"u_rated": 120.0, "play_0": -0.05, "square_0": 0.02, **values})
 
 
 @slow
@@ -402,9 +402,9 @@ def test_loops_of_plays_and_squares_prefer_the_spectrum(tmp_path: Path) -> None:
 def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
     make_record(None, 3, tmp_path / "record.csv")
     record = psa.read_record(tmp_path / "record.csv").slice(0, 1000)
-    found = psa.identify(record, hysteresis="best")
-    assert "bouc_wen" in [c.name for c in found.model.components]
-    assert any(s.startswith("hysteresis: Bouc-Wen") for s in found.sentences)
+    result = psa.identify(record, hysteresis="best")
+    assert "bouc_wen" in [c.name for c in result.model.components]
+    assert any(s.startswith("hysteresis: Bouc-Wen") for s in result.sentences)
 
 
 def test_a_model_without_hysteresis_has_no_other_form() -> None:
@@ -491,8 +491,8 @@ def test_a_drive_lag_stands_beside_the_base_at_every_amplitude(
     responses = []
     lagging = with_effect(DRIVE_LAG, drive_lag_time=lag, drive_lag_shape=shape)
     for model in (lagging, stack(STACK)):
-        shown = simulated(model.with_values(LINEAR), t, voltage)["measured_displacement"]
-        responses.append(tone(t[late], shown[late], frequency))
+        displayed = simulated(model.with_values(LINEAR), t, voltage)["measured_displacement"]
+        responses.append(tone(t[late], displayed[late], frequency))
     ratio = responses[0] / responses[1]
     angle = 2 * np.pi * frequency * lag
     expected = 1.0 / (1.0 + 1j * angle - shape * angle**2)
@@ -507,10 +507,10 @@ def test_a_leaking_charge_drive_droops_to_what_does_not_leak() -> None:
     voltage = np.where(t > 0.0, 100.0, 0.0)
     late = t > 0.02
     expected = 1 - gain * (1 - np.exp(-(t[late] - 0.0025) / time))  # the ramp's middle
-    found = simulated(model, t, voltage)
-    np.testing.assert_allclose(found["u"][late], 100.0 * expected, rtol=1e-4)
-    shown = found["measured_displacement"][late] / (stroke(model) * 100.0 / 120.0)
-    np.testing.assert_allclose(shown, expected, rtol=3e-4)
+    result = simulated(model, t, voltage)
+    np.testing.assert_allclose(result["u"][late], 100.0 * expected, rtol=1e-4)
+    displayed = result["measured_displacement"][late] / (stroke(model) * 100.0 / 120.0)
+    np.testing.assert_allclose(displayed, expected, rtol=3e-4)
     settled = simulated(model, t, np.full_like(t, 100.0))["u"]
     np.testing.assert_allclose(settled, 70.0, rtol=1e-9)
 
@@ -526,9 +526,9 @@ def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(
     )  # fmt: skip
     t = np.linspace(0.0, 2.0, 2001)
     voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t)) * (0.5 + 0.25 * t)
-    found = simulated(model, t, voltage)
-    x, size = found["displacement"], stroke(model)
-    residual = found["measured_displacement"] - x
+    result = simulated(model, t, voltage)
+    x, size = result["displacement"], stroke(model)
+    residual = result["measured_displacement"] - x
     series = Legendre([0.0, 0.0, np.cos(angle), np.sin(angle), wave], domain=[0.0, 1.0])
     bent = series(x / size) - series(0.0) - series.deriv()(0.0) * x / size
     np.testing.assert_allclose(residual, 0.01 * bent * size, rtol=0, atol=1e-9 * size)
@@ -552,9 +552,9 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
         ripple_second_cosine=0.3, ripple_second_sine=-0.4,
     )  # fmt: skip
     t = np.linspace(0.0, 2.0, 4001)
-    found = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
-    x = found["displacement"]
-    residual = found["measured_displacement"] - x
+    result = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
+    x = result["displacement"]
+    residual = result["measured_displacement"] - x
     assert residual[0] == 0.0
     for branch in (np.gradient(x) > 0, np.gradient(x) < 0):
         angle = 2 * np.pi * x[branch] / period
@@ -571,9 +571,9 @@ def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() 
     model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=0.003)
     width = 0.003 * stroke_scale(model.values)
     t = np.linspace(0.0, 2.0, 4001)
-    found = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
-    x = found["displacement"]
-    residual = found["measured_displacement"] - x
+    result = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
+    x = result["displacement"]
+    residual = result["measured_displacement"] - x
     assert residual[0] == 0.0
     far = np.abs(x - place) > 10 * width
     np.testing.assert_allclose(residual[far], 3e-8 * (x[far] > place), rtol=0, atol=1e-15)
@@ -591,8 +591,8 @@ def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -
         2001.0
     )  # 90.9 samples per second: 50 Hz shows at its alias
     voltage = np.where(t < 10.0, 40.0, 40.0 * (1.0 + 0.5 * np.sin(t - 10.0)))
-    found = simulated(model, t, voltage, memory={"hum_cosine": 0.6, "hum_sine": -0.8}, rtol=1e-6)
-    hum = found["measured_displacement"] - found["displacement"]
+    result = simulated(model, t, voltage, memory={"hum_cosine": 0.6, "hum_sine": -0.8}, rtol=1e-6)
+    hum = result["measured_displacement"] - result["displacement"]
     angle = 100 * np.pi * t
     expected = 2e-8 * (0.6 * np.cos(angle) - 0.8 * np.sin(angle))
     assert t[-1] - t[0] > 1000 / 50.0
@@ -608,11 +608,11 @@ def test_expansion_follows_the_temperature_with_its_lag(single: bool) -> None:
     lag = 20.0
     model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3, "temperature_lag": lag})
     t = np.linspace(0.0, 1000.0, 1001)
-    found = simulated(model, t, np.zeros_like(t), temperature=ROOM + 1.5 + 0.003 * t)
-    shown = found["measured_displacement"]
+    result = simulated(model, t, np.zeros_like(t), temperature=ROOM + 1.5 + 0.003 * t)
+    displayed = result["measured_displacement"]
     follows = 1.5 + 0.003 * (t - lag + lag * np.exp(-t / lag))
-    np.testing.assert_allclose(shown, 2e-3 * follows * stroke(model), rtol=1e-5, atol=0)
-    assert not np.any(found["displacement"])
+    np.testing.assert_allclose(displayed, 2e-3 * follows * stroke(model), rtol=1e-5, atol=0)
+    assert not np.any(result["displacement"])
 
 
 def test_the_gain_grows_with_temperature() -> None:
@@ -621,7 +621,7 @@ def test_the_gain_grows_with_temperature() -> None:
     model = with_effect(TEMPERATURE, **values).with_values(LINEAR)
     t = np.linspace(0.0, 1000.0, 1001)
     rise, voltage = 0.01 * t, 60.0 * (1.0 - np.cos(0.1 * t))
-    shown = simulated(model, t, voltage, temperature=ROOM + rise)["measured_displacement"]
+    displayed = simulated(model, t, voltage, temperature=ROOM + rise)["measured_displacement"]
     g = 2e-3 * rise
     expected = stroke(model) * (voltage / 120.0 * (1 + 1.5 * g) + g)
-    np.testing.assert_allclose(shown, expected, rtol=0, atol=1e-4 * stroke(model))
+    np.testing.assert_allclose(displayed, expected, rtol=0, atol=1e-4 * stroke(model))

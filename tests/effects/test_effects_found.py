@@ -54,11 +54,11 @@ def test_modes_are_read_off_a_residual() -> None:
     left = sum(share * response(f, z, drive, time) for f, z, share in HIDDEN)
     left = left + 1e-3 * np.std(left) * noise(COUNT, 2)
     shaken = Shaken(drive, left, np.ones(COUNT, bool), 1.0 / RATE)
-    found = sorted(
+    items = sorted(
         modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95), key=lambda m: m.frequency
     )
-    assert len(found) == len(HIDDEN)
-    for mode, (frequency, damping, share) in zip(found, HIDDEN, strict=True):
+    assert len(items) == len(HIDDEN)
+    for mode, (frequency, damping, share) in zip(items, HIDDEN, strict=True):
         assert mode.frequency == pytest.approx(frequency, rel=1e-3)
         assert mode.damping == pytest.approx(damping, rel=0.03)
         assert mode.share == pytest.approx(share, rel=0.03)
@@ -87,12 +87,12 @@ def test_its_equations_are_those_of_modal_superposition() -> None:
     voltage = multisine(time, 0.0, 80.0, (20.0, 1500.0), seed=3)
     voltage *= np.clip((time - 0.002) / 0.01, 0.0, 1.0)  # it begins at rest
     base = psa.simulate(psa.stack_model("P-885.51"), time, voltage, rtol=1e-6)
-    own = psa.simulate(model, time, voltage, rtol=1e-6)
+    item = psa.simulate(model, time, voltage, rtol=1e-6)
     k = model.values
     rest = base.states["f_out"] * (1.0 / k["k_P"] + 1.0 / k["k_B"])
     added = sum(share * response(f, z, rest, time) for f, z, share in HIDDEN[:2])
     size = np.ptp(added)
-    np.testing.assert_allclose(own.displacement - base.displacement, added, atol=2e-3 * size)
+    np.testing.assert_allclose(item.displacement - base.displacement, added, atol=2e-3 * size)
 
 
 def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> psa.Record:
@@ -114,16 +114,16 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
 def test_several_modes_are_found_together_and_again_from_what_was_found() -> None:
     like = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay")]
     more = [psa.EFFECTS[n] for n in ("hysteresis_memory", "slow_creep", "load_stiffness")]
-    found = psa.diagnose([shaken_stack(11)], effects=[*like, *more])
-    (cause,) = found.causes
+    result = psa.diagnose([shaken_stack(11)], effects=[*like, *more])
+    (cause,) = result.causes
     assert cause.effect.startswith("modal_series")
-    assert found.base_errors.holdout_nrmse_percent > 1.0
-    assert found.extended_errors.holdout_nrmse_percent < 0.12  # the noise is 0.1
-    values = found.extended_fit.model.values
+    assert result.base_errors.holdout_nrmse_percent > 1.0
+    assert result.extended_errors.holdout_nrmse_percent < 0.12  # the noise is 0.1
+    values = result.extended_fit.model.values
     tones = np.array([v for n, v in values.items() if n.startswith("series_frequency")])
     for frequency, _, _ in HIDDEN:
         assert np.min(np.abs(tones / frequency - 1.0)) < 2e-3
-    again = psa.diagnose([shaken_stack(11)], model=found.model, effects=like)
+    again = psa.diagnose([shaken_stack(11)], model=result.model, effects=like)
     assert again.base_errors.holdout_nrmse_percent > 1.0
     assert [c.effect.startswith("modal_series") for c in again.causes] == [True]
 
@@ -153,7 +153,7 @@ def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> 
     phases = rng.uniform(0.0, 6.28, len(tones))
     waves = [np.sin(2 * np.pi * f * t + p) for f, p in zip(tones, phases, strict=True)]
     voltage: FloatArray = 60.0 + 50.0 * np.sum(waves, axis=0) / len(tones)
-    found = reference.simulate(
+    result = reference.simulate(
         STACK.values,
         lambda time: float(np.interp(time, t, voltage)),
         t,
@@ -161,9 +161,11 @@ def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> 
         initial={"u": voltage[0]},
         rtol=1e-7,
     )
-    current = found.current + noise * np.std(found.current) * rng.standard_normal(t.size)
-    shown = found.displacement + 2e-9 * rng.standard_normal(t.size)
-    return Record(name="r", time=t, voltage=voltage, displacement=shown, current=current + 0.003)
+    current = result.current + noise * np.std(result.current) * rng.standard_normal(t.size)
+    displayed = result.displacement + 2e-9 * rng.standard_normal(t.size)
+    return Record(
+        name="r", time=t, voltage=voltage, displacement=displayed, current=current + 0.003
+    )
 
 
 @pytest.fixture(scope="module")
@@ -172,13 +174,13 @@ def fast() -> Record:
 
 
 def test_a_current_tells_the_capacitance(fast: Record) -> None:
-    found = capacitance_of([fast])
-    assert found is not None
-    assert found.value == pytest.approx(C_P, abs=4.0 * found.error)
-    assert found.error < 0.005 * C_P
-    assert found.interval.low < found.value < found.interval.high
-    assert "C_p =" in found.sentence(found.value)
-    assert "keeps the 3 uF given" in found.sentence(3e-6)
+    capacitance = capacitance_of([fast])
+    assert capacitance is not None
+    assert capacitance.value == pytest.approx(C_P, abs=4.0 * capacitance.error)
+    assert capacitance.error < 0.005 * C_P
+    assert capacitance.interval.low < capacitance.value < capacitance.interval.high
+    assert "C_p =" in capacitance.sentence(capacitance.value)
+    assert "keeps the 3 uF given" in capacitance.sentence(3e-6)
 
 
 @pytest.mark.parametrize("capacitance", [1e-8, 1.6e-6, 5e-5])
@@ -189,12 +191,12 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
     omega, loss = 2 * np.pi, 0.03
     clean = capacitance * omega * 40.0 * (np.sin(omega * t) - loss * np.cos(omega * t))
     noise = 0.01 * np.std(clean) * np.random.default_rng(2).standard_normal(t.size)
-    found = capacitance_of(
+    result = capacitance_of(
         [Record(name="r", time=t, voltage=voltage, displacement=None, current=clean + noise)]
     )
-    assert found is not None
-    assert found.value == pytest.approx(capacitance, rel=0.01)
-    assert found.error < 0.01 * capacitance
+    assert result is not None
+    assert result.value == pytest.approx(capacitance, rel=0.01)
+    assert result.error < 0.01 * capacitance
 
 
 @slow
@@ -210,15 +212,15 @@ def test_a_current_that_is_not_the_stack_s_tells_nothing(fast: Record) -> None:
 @slow
 def test_an_identified_model_has_the_measured_capacitance(fast: Record) -> None:
     """Without the current the capacitance is assumed, and the simulated current as wrong."""
-    found = psa.identify([fast.slice(0, 700)])
-    assert found.model.values["C_p"] == pytest.approx(C_P, rel=0.01)
-    interval = found.model.provenance.intervals["C_p"]
-    assert interval.low < found.model.values["C_p"] < interval.high
-    assert any("measured current" in n for n in found.model.provenance.notes)
-    rows = {row[0]: row for row in parameter_table(found.model, found).rows}
+    result = psa.identify([fast.slice(0, 700)])
+    assert result.model.values["C_p"] == pytest.approx(C_P, rel=0.01)
+    interval = result.model.provenance.intervals["C_p"]
+    assert interval.low < result.model.values["C_p"] < interval.high
+    assert any("measured current" in n for n in result.model.provenance.notes)
+    rows = {row[0]: row for row in parameter_table(result.model, result).rows}
     assert [rows[n][4] for n in ("C_p", "k_L")] == ["current", "fit"]
-    given = replace(found.model, values={**found.model.values, "C_p": 3e-6})
-    noted = psa.identify([fast.slice(0, 200)], model=given).model.provenance.notes
+    inputs = replace(result.model, values={**result.model.values, "C_p": 3e-6})
+    noted = psa.identify([fast.slice(0, 200)], model=inputs).model.provenance.notes
     assert any("keeps the 3 uF given" in n for n in noted)
 
 
@@ -304,6 +306,6 @@ def test_a_fit_switches_an_effect_on_that_the_model_has_off() -> None:
     base = starting_model([record])
     model = psa.compose([*psa.BASE, _MEMORY], dict(base.values))
     assert model.values["memory_gain"] == 0.0
-    found = fit_base(model, [whole(record)])
-    assert found.model.values["memory_gain"] == 1.0
-    assert found.rms < 0.5 * fit_base(base, [whole(record)]).rms
+    fit = fit_base(model, [whole(record)])
+    assert fit.model.values["memory_gain"] == 1.0
+    assert fit.rms < 0.5 * fit_base(base, [whole(record)]).rms

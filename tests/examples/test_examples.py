@@ -56,7 +56,7 @@ FIGURES: dict[str, list[tuple[float, float]]] = {
 )
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path.parent)
-    found = run_example(name, Path(tmp_path.name))  # as `psa examples NAME -o FOLDER` is typed
+    result = run_example(name, Path(tmp_path.name))  # as `psa examples NAME -o FOLDER` is typed
     left = list(tmp_path.iterdir())
     assert left
     for path in left:
@@ -65,29 +65,29 @@ def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
             assert np.std(matplotlib.image.imread(path)[..., :3]) > 0.01, path
     if name not in FIGURES:
         return
-    assert isinstance(found, dict)
-    for (what, value), (low, high) in zip(found.items(), FIGURES[name], strict=True):
+    assert isinstance(result, dict)
+    for (what, value), (low, high) in zip(result.items(), FIGURES[name], strict=True):
         assert low <= value <= high, what
     if name == "use_in_casadi":
-        assert list(found.values())[1] == pytest.approx(_slope_by_differences(), rel=1e-4)
+        assert list(result.values())[1] == pytest.approx(_slope_by_differences(), rel=1e-4)
     if name == "co_simulation":
         held, sloped = (
-            found[f"error at 2 us, {how} [%]"] for how in ("values held", "with slopes")
+            result[f"error at 2 us, {how} [%]"] for how in ("values held", "with slopes")
         )
         assert sloped > held
     if name == "uncertainty_in_fmpy":  # two ways; 20 samples tell one to a sixth
-        *_, by_points, by_samples = found.values()
+        *_, by_points, by_samples = result.values()
         assert by_samples == pytest.approx(by_points, rel=0.5)
 
 
 def test_every_example_and_recipe_has_a_title_of_its_own() -> None:
-    found = examples()
-    assert set(FIGURES) <= set(EXAMPLES) <= set(found)
-    titles = [e.title for e in found.values()]
+    result = examples()
+    assert set(FIGURES) <= set(EXAMPLES) <= set(result)
+    titles = [e.title for e in result.values()]
     assert len(set(titles)) == len(titles)
     assert all(15 < len(t) < 120 for t in titles), titles
     for name in EXAMPLES:
-        assert "def main(folder: Path)" in found[name].text, name
+        assert "def main(folder: Path)" in result[name].text, name
 
 
 def test_twelve_lines_make_a_model() -> None:
@@ -114,9 +114,9 @@ def _run(*words: str | Path) -> Ended:
 
 
 def test_the_list_names_all() -> None:
-    shown = _run()
-    assert shown.code == 0
-    table, _, _ = shown.out.rpartition("\n\n")
+    displayed = _run()
+    assert displayed.code == 0
+    table, _, _ = displayed.out.rpartition("\n\n")
     head, _, *rows = re.split(r"\n(?=\S)", table)
     title = head.index("what it shows")
     for row, (name, example) in zip(rows, examples().items(), strict=True):

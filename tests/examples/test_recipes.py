@@ -139,8 +139,10 @@ def test_the_matlab_script() -> None:
     ports = {k: [v for v in variables if v.causality == k] for k in ("input", "output")}
     known = {"model": {"StopTime", "SolverType", "FixedStep"}}
     wires: dict[str, str] = {}
-    for call, given in re.findall(r"^(add_block|set_param|add_line)\((.*)\);$", text, re.MULTILINE):
-        words = re.findall(r"'([^']*)'", given)
+    for call, inputs in re.findall(
+        r"^(add_block|set_param|add_line)\((.*)\);$", text, re.MULTILINE
+    ):
+        words = re.findall(r"'([^']*)'", inputs)
         if call == "add_line":
             wires[words[1]] = words[0]
             continue
@@ -154,8 +156,8 @@ def test_the_matlab_script() -> None:
     assert "'FMUName', 'stack.fmu'" in text
     fed = {v.name: wires[f"Stack/{k}"] for k, v in enumerate(ports["input"], 1)}
     assert fed == {"voltage": "Voltage/1", "load_force": "Load/1"}
-    shown = int(wires["Displacement/1"].removeprefix("Stack/"))
-    assert ports["output"][shown - 1].name == "displacement"
+    displayed = int(wires["Displacement/1"].removeprefix("Stack/"))
+    assert ports["output"][displayed - 1].name == "displacement"
     for kind, row in ports.items():
         listed = ", ".join(f"{i} {v.name} [{v.unit}]" for i, v in enumerate(row, 1))
         assert f"% {kind}s: {listed}\n" in text
@@ -206,8 +208,8 @@ def test_what_omsimulator_makes_of_them(made: Path) -> None:
     held = psa.settled_at(psa.stack_model("P-885.51"), 60.0, [120.0, 0.0])
     expected = psa.simulate(held, [0.0, 1e-3], [60.0, 60.0]).displacement[-1]
     for name in ("held.csv", "held_cs.csv"):
-        found = np.genfromtxt(made / name, delimiter=",", names=True)["displacement"]
-        assert found == pytest.approx(expected, rel=1e-9)
+        result = np.genfromtxt(made / name, delimiter=",", names=True)["displacement"]
+        assert result == pytest.approx(expected, rel=1e-9)
     rows = np.loadtxt(made / "nanopositioner.csv", delimiter=",", skiprows=1)
     assert rows[-1, 0] == pytest.approx(0.01)
 
@@ -264,8 +266,8 @@ def test_the_jobs_of_ci_are_yaml_and_their_commands_run(
     assert kept == {"stack.fmu", "stack3.fmu", "diagnosis.xml", "check.xml", "check3.xml"}
     psa.export_fmu(psa.stack_model("P-885.51"), "other.fmu")
     judge = [sys.executable, "judge.py", "model.json", "other.fmu"]
-    said = subprocess.run(judge, check=False, capture_output=True, text=True).stderr
-    assert said.endswith("ModelExchange differs by more than 0.1 % of the range\n")
+    statement = subprocess.run(judge, check=False, capture_output=True, text=True).stderr
+    assert statement.endswith("ModelExchange differs by more than 0.1 % of the range\n")
 
 
 def test_scripts_are_found_on_a_page() -> None:
@@ -289,9 +291,9 @@ def test_an_own_effect_is_found_with_the_size_that_was_put_in(
             subprocess.run([sys.executable, *shlex.split(command)[1:]], check=True)
         else:
             run_command(command)
-    own = psa.own_effects("pickup")
+    components = psa.own_effects("pickup")
     monkeypatch.delitem(sys.modules, "pickup")
-    values = psa.load_model("extended.json", own.values()).values
+    values = psa.load_model("extended.json", components.values()).values
     assert values["pickup_gain"] == pytest.approx(4e-9, rel=0.02)
     assert values["pickup_time"] == pytest.approx(0.05, rel=0.02)
     names = [v.name for v in read_model_description("stack.fmu").modelVariables]

@@ -60,8 +60,8 @@ class Instance3(importer.Instance):
         self, fmu: Fmu, interface: int = CO_SIMULATION, *, events: bool = False,
         early: bool = True, watcher: Watcher | None = None,
     ) -> None:  # fmt: skip
-        def look(_: int, *told: Any) -> None:
-            *update, wanted, until = told
+        def look(_: int, *output: Any) -> None:
+            *update, wanted, until = output
             end = watcher(self, Update(*update)) if watcher else None
             if end is not None:
                 wanted[0], until[0] = c_bool(True), c_double(end)

@@ -45,8 +45,8 @@ def simulated(text: str, name: str, span: float, rtol: float = 1e-11) -> Mapping
     """Return every variable of a run of a class from 0 to span [s], and its times as "time"."""
     config = rumoca.SimConfig(solver="bdf", rtol=rtol, atol=1e-16, dt=span / _SAMPLES)
     result = load(text, name).simulate(t=(0.0, span), config=config)
-    found = {n: np.asarray(result[n]) for n in result.names}
-    return {**found, "time": np.asarray(result.time)}
+    table = {n: np.asarray(result[n]) for n in result.names}
+    return {**table, "time": np.asarray(result.time)}
 
 
 def signal_class(text: str) -> str:
@@ -92,7 +92,7 @@ def right_side_error(model: psa.Model, text: str, points: int = 5) -> float:
     At the last point the voltage is held: its rate is below `hold_rate`.
     """
     read = read_back(pure_ode(model, text))
-    given = dict(zip(read.parameter_names, read.default_parameters, strict=True))
+    inputs = dict(zip(read.parameter_names, read.default_parameters, strict=True))
     values, draw = model.values, np.random.default_rng(1)
     starts = np.array([i.start for i in model.structure.inputs])
     sizes = np.array([50.0, 100.0, 10.0])[: len(starts)]
@@ -104,11 +104,11 @@ def right_side_error(model: psa.Model, text: str, points: int = 5) -> float:
             u[0], x[0] = 0.0, 0.7 * values["hold_rate"] * (values["R_s"] * values["C_p"])
         time = float(draw.uniform(0.1, 5.0))
         expected = model.structure.f(time, x, u, model.parameter_vector())
-        given |= dict(zip(model.state_names, x, strict=True))
-        given |= dict(zip(model.input_names, u, strict=True))
-        given |= {f"integral_{n}": 0.0 for n in model.output_names}
+        inputs |= dict(zip(model.state_names, x, strict=True))
+        inputs |= dict(zip(model.input_names, u, strict=True))
+        inputs |= {f"integral_{n}": 0.0 for n in model.output_names}
         names = (read.state_names, read.input_names, read.parameter_names)
-        rates = np.array(read.rhs(time, *([given[n] for n in own] for own in names))).ravel()
+        rates = np.array(read.rhs(time, *([inputs[n] for n in item] for item in names))).ravel()
         got = dict(zip(read.state_names, rates, strict=True))
         left = [*model.state_names, *(f"integral_{n}" for n in model.output_names)]
         right = np.concatenate([np.array(v).ravel() for v in expected])

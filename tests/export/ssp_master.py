@@ -96,19 +96,19 @@ def _number(text: str) -> float:
 
 def _parameters(system: Any) -> dict[str, dict[str, float]]:
     """Return the parameters of each part from the sets of the parts, then those of the system."""
-    found: dict[str, dict[str, float]] = {c.name: {} for c in system.elements}
+    table: dict[str, dict[str, float]] = {c.name: {} for c in system.elements}
     for owner in (*system.elements, system):
         for binding in owner.parameterBindings:
-            given = {
+            inputs = {
                 p.name: _number(p.value) for s in binding.parameterValues for p in s.parameters
             }
             if owner is not system:
-                found[owner.name] |= given
+                table[owner.name] |= inputs
                 continue
             for entry in (e for m in binding.parameterMapping for e in m.mappingEntries):
                 part, _, variable = entry.target.partition(".")
-                found[part][variable] = given[entry.source]
-    return found
+                table[part][variable] = inputs[entry.source]
+    return table
 
 
 def couple(
@@ -132,12 +132,12 @@ def couple(
     origins = [archive.origin(name) for name in outputs]
     outer = [w for w in archive.wires if w.start.part == OUTSIDE and w.start.name in inputs.names]
     inner, columns = archive.inner_wires(), dict(zip(inputs.names, inputs.at(times).T, strict=True))
-    starts = {name: dict(own) for name, own in archive.parameters.items()}
-    given = {
+    starts = {name: dict(item) for name, item in archive.parameters.items()}
+    table = {
         **(values or {}),
         **{f"{w.end.part}.{w.end.name}": columns[w.start.name][0] for w in outer},
     }
-    for name, value in given.items():
+    for name, value in table.items():
         part, _, variable = name.partition(".")
         starts[part][variable] = float(value)
     options: dict[str, Any] = {"tolerance": tolerance, "start_time": float(times[0])}
@@ -194,10 +194,10 @@ def settles(archive: SspArchive, step: float, values: Mapping[str, float], *, sl
     kick = Signals(("command",), times[:1], np.array([[_KICK]]), held=True)
     how: Any = {"rates": slopes, "values": values, "tolerance": _TOLERANCE}
     try:
-        found = couple(archive, times, kick, ["flexure.reaction_force"], **how)[:, 0]
+        result = couple(archive, times, kick, ["flexure.reaction_force"], **how)[:, 0]
     except FmuError:
         return False
-    rough, third = np.abs(np.diff(found, 2)), _COUNT // 3
+    rough, third = np.abs(np.diff(result, 2)), _COUNT // 3
     early, later, last = rough[:third].max(), rough[third:-third].max(), rough[-third:].max()
     return bool(last < max(later, _SETTLED * early))
 

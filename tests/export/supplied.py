@@ -31,11 +31,11 @@ def level(area: float, outlet: float, flow: FloatArray = INFLOW) -> FloatArray:
     """Return the level of the supplier's tank with an open valve, by SciPy."""
 
     def rate(t: float, h: FloatArray) -> FloatArray:
-        given = float(np.interp(t, TIMES, flow))
-        return (given - outlet * np.sqrt(np.maximum(0.0, 19.62 * h))) / area
+        inputs = float(np.interp(t, TIMES, flow))
+        return (inputs - outlet * np.sqrt(np.maximum(0.0, 19.62 * h))) / area
 
-    found = solve_ivp(rate, (0.0, 100.0), [0.2], t_eval=TIMES, rtol=1e-9, max_step=0.2)
-    return np.asarray(found.y[0])
+    result = solve_ivp(rate, (0.0, 100.0), [0.2], t_eval=TIMES, rtol=1e-9, max_step=0.2)
+    return np.asarray(result.y[0])
 
 
 def lagged(y: FloatArray, time: float) -> FloatArray:
@@ -44,29 +44,29 @@ def lagged(y: FloatArray, time: float) -> FloatArray:
     def rate(t: float, z: FloatArray) -> FloatArray:
         return (float(np.interp(t, TIMES, y)) - z) / time
 
-    found = solve_ivp(rate, (0.0, 100.0), y[:1], t_eval=TIMES, rtol=1e-8, max_step=0.2)
-    return np.asarray(found.y[0])
+    result = solve_ivp(rate, (0.0, 100.0), y[:1], t_eval=TIMES, rtol=1e-8, max_step=0.2)
+    return np.asarray(result.y[0])
 
 
 def bounces(g: float, e: float, times: FloatArray) -> FloatArray:
     """Return the height of a ball dropped from 1 m, from the sum of its flights."""
-    begins, lasts = 0.0, np.sqrt(2.0 / g)
+    starts, lasts = 0.0, np.sqrt(2.0 / g)
     first = np.where(times < lasts, 1.0 - 0.5 * g * times**2, 0.0)
-    begins, speed = lasts, e * np.sqrt(2.0 * g)
-    found = first
+    starts, speed = lasts, e * np.sqrt(2.0 * g)
+    text = first
     while speed > 1e-3:
-        at, lasts = times - begins, 2.0 * speed / g
-        found = np.where((at >= 0) & (at < lasts), speed * at - 0.5 * g * at**2, found)
-        begins, speed = begins + lasts, e * speed
-    return np.asarray(found)
+        at, lasts = times - starts, 2.0 * speed / g
+        text = np.where((at >= 0) & (at < lasts), speed * at - 0.5 * g * at**2, text)
+        starts, speed = starts + lasts, e * speed
+    return np.asarray(text)
 
 
 def main() -> None:
     """Write what docs/howto/fmu.md takes for granted: tank.fmu, run.csv and plant.fmu."""
     Path("tank.fmu").write_bytes(supplied("tank").read_bytes())
-    shown = lagged(level(0.7, 0.01), 3.0)
-    shown += 1e-3 * np.random.default_rng(1).standard_normal(len(TIMES))
-    columns = [TIMES, INFLOW, np.ones(len(TIMES)), shown]
+    displayed = lagged(level(0.7, 0.01), 3.0)
+    displayed += 1e-3 * np.random.default_rng(1).standard_normal(len(TIMES))
+    columns = [TIMES, INFLOW, np.ones(len(TIMES)), displayed]
     head = "time,inflow,valve,level"
     np.savetxt("run.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
     speed, torque = ca.SX.sym("speed"), ca.SX.sym("torque")

@@ -80,12 +80,12 @@ def errors(found: FixedStep) -> dict[str, float]:
 
 
 def test_the_base_errs_by_what_its_header_says() -> None:
-    found = errors(made())
-    assert set(found) == set(VOLTAGES)
-    assert all(0.0 < e <= 2e-4 for e in found.values())
-    assert max(found["sine"], found["ramps and holds"]) <= 1e-6
+    result = errors(made())
+    assert set(result) == set(VOLTAGES)
+    assert all(0.0 < e <= 2e-4 for e in result.values())
+    assert max(result["sine"], result["ramps and holds"]) <= 1e-6
     header = made().texts["stack.h"]
-    assert all(f"{name:16} {value:.1e}" in header for name, value in found.items())
+    assert all(f"{name:16} {value:.1e}" in header for name, value in result.items())
 
 
 @slow
@@ -100,19 +100,19 @@ def test_single_precision_rests_in_a_hold() -> None:
 
 @pytest.mark.parametrize("precision", PRECISIONS)
 def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str) -> None:
-    found = made(precision)
-    source, suffix = found.texts["stack.c"], PRECISIONS[precision].suffix
-    assert re.findall(r"#include (.*)", found.texts["stack.h"] + source) == [
+    result = made(precision)
+    source, suffix = result.texts["stack.c"], PRECISIONS[precision].suffix
+    assert re.findall(r"#include (.*)", result.texts["stack.h"] + source) == [
         '"stack.h"',
         "<math.h>",
     ]
-    own = {"advance", "outputs", "gain", "stack_init", "stack_step"}
+    item = {"advance", "outputs", "gain", "stack_init", "stack_step"}
     code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    assert set(re.findall(r"(\w+)\(", code)) <= own | {name + suffix for name in CALLS}
+    assert set(re.findall(r"(\w+)\(", code)) <= item | {name + suffix for name in CALLS}
     assert not re.search(r"\b(for|while|do|if|goto|static \w+ \w+\[)\b", code)
     commands = [compiler_command(), *([zig_command()] if has_zig() else [])]
     with temporary_folder() as folder:
-        for name, text in found.texts.items():
+        for name, text in result.texts.items():
             (folder / name).write_text(text, encoding="utf-8")
         for command in commands:
             run_compiler([*command, *STRICT, "-c", "stack.c", "-o", "stack.o"], folder)
@@ -129,11 +129,11 @@ def test_what_kinks_or_feeds_back_to_the_hysteresis_is_stepped_as_a_whole(
     component: psa.Component,
 ) -> None:
     model = psa.compose((*psa.BASE, component), stack("P-885.51").values).plant()
-    found = fixed_step(model, name="stack", step=STEP, substeps=8)
-    assert all(0.0 < e <= 1e-3 for e in errors(found).values())
+    result = fixed_step(model, name="stack", step=STEP, substeps=8)
+    assert all(0.0 < e <= 1e-3 for e in errors(result).values())
     wave = 60.0 * (1.0 - np.cos(np.arange(901) / 70.0))
     away = psa.simulate(model.without([component.name]), STEP * np.arange(901), wave)
-    assert error(play(found, wave), away.outputs[OUTPUT][1:]) > 1e-2
+    assert error(play(result, wave), away.outputs[OUTPUT][1:]) > 1e-2
 
 
 def test_a_clock_in_single_precision_is_refused() -> None:
@@ -162,10 +162,10 @@ def test_a_sampled_part_acts_at_its_period() -> None:
     ],
 )
 def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], said: str) -> None:
-    given = {"name": "stack", "step": STEP, **wrong}
+    table = {"name": "stack", "step": STEP, **wrong}
     model = with_effect("backlash") if "substeps" in wrong else stack("P-885.51")
     with pytest.raises(psa.InputError, match=said):
-        fixed_step(model, **given)  # type: ignore[arg-type]  # wrong on purpose
+        fixed_step(model, **table)  # type: ignore[arg-type]  # wrong on purpose
 
 
 @pytest.mark.parametrize(
@@ -209,9 +209,9 @@ def test_every_effect_and_every_stack_is_exported_and_compared() -> None:
         clock = name in ("ageing", "mains_hum", "offset_drift")
         precision = "double" if k % 2 or clock else "single"
         model = with_effect(name, stack_name)
-        found = fixed_step(model, name="stack", step=STEP, precision=precision)
-        if not found.worst.error <= limit(name):
-            far[name, stack_name] = (found.plan.substeps, found.worst)
+        result = fixed_step(model, name="stack", step=STEP, precision=precision)
+        if not result.worst.error <= limit(name):
+            far[name, stack_name] = (result.plan.substeps, result.worst)
     assert not far
 
 
@@ -221,33 +221,33 @@ TOLD = (HERE / "told.c").read_text("utf-8")
 
 def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     """900 V, 7.5 times the rated voltage, gave half a range of error; the limit is far above it."""
-    found, share = made(step=LONG_STEP), np.linspace(0.0, 1.0, 401)
-    limit, model = found.plan.limit, found.plan.model
+    result, share = made(step=LONG_STEP), np.linspace(0.0, 1.0, 401)
+    limit, model = result.plan.limit, result.plan.model
     assert 1.25 * model.values["u_rated"] <= limit < 900.0
     jumps = limit * np.select([share < 0.1, share < 0.5, share < 0.8], [0.0, 1.0, -1.0], 1.0)
     t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
     true = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
-    within = play(found, jumps)
-    shown = true[1:, model.output_names.index(OUTPUT)]
-    assert error(within, shown) <= max(GOOD, found.worst.error)
+    within = play(result, jumps)
+    displayed = true[1:, model.output_names.index(OUTPUT)]
+    assert error(within, displayed) <= max(GOOD, result.worst.error)
     for beyond in (1.001, 900.0 / limit, 1e9, 1e305):
-        assert np.array_equal(play(found, beyond * jumps), within)
+        assert np.array_equal(play(result, beyond * jumps), within)
 
 
 @pytest.mark.parametrize("precision", ["double", pytest.param("single", marks=slow)])
 def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> None:
-    found = made(precision, LONG_STEP)
-    library = ctypes.CDLL(str(shared_library({**found.texts, "told.c": TOLD}, ())))
-    assert "Returns 1 if the voltage was beyond" in " ".join(found.texts["stack.h"].split())
+    result = made(precision, LONG_STEP)
+    library = ctypes.CDLL(str(shared_library({**result.texts, "told.c": TOLD}, ())))
+    assert "Returns 1 if the voltage was beyond" in " ".join(result.texts["stack.h"].split())
 
     def told(*voltage: float) -> tuple[int, float]:
         x = ctypes.c_double()
-        given = (ctypes.c_double * len(voltage))(*voltage)
-        return library.told(given, len(voltage), ctypes.byref(x)), x.value
+        inputs = (ctypes.c_double * len(voltage))(*voltage)
+        return library.told(inputs, len(voltage), ctypes.byref(x)), x.value
 
     assert told(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
     assert told(60.0, 60.0, np.nan) == (0b001, told(60.0, 60.0, 60.0)[1])
-    assert told(60.0, np.inf)[1] == told(60.0, found.plan.limit)[1]
+    assert told(60.0, np.inf)[1] == told(60.0, result.plan.limit)[1]
 
 
 PERIOD, SAMPLES = 1e-4, 40_000
@@ -263,8 +263,8 @@ def code_of(model: psa.Model, precision: str) -> FixedStep:
 
 def played(model: psa.Model, precision: str, inputs: FloatArray) -> FloatArray:
     """Return the outputs (n, ny) of the code on inputs (n, nu), one call for each."""
-    found = code_of(model, precision)
-    return Probe(found.plan, found.texts).play(np.vstack([inputs[:1], inputs]))
+    result = code_of(model, precision)
+    return Probe(result.plan, result.texts).play(np.vstack([inputs[:1], inputs]))
 
 
 @cache
@@ -286,13 +286,13 @@ def test_feed_forward_and_observer_are_the_python_objects(precision: str) -> Non
     forward, observer = psa.FeedForward(values()), psa.HysteresisObserver(values())
     volts = np.array([forward.step(w) for w in wanted().tolist()])
     force = np.array([observer.step(u) for u in volts.tolist()])
-    for block, given, expected in (
+    for block, inputs, expected in (
         (forward, wanted(), volts),
         (observer, volts, force),
     ):
-        found = played(block.model, precision, given[:, None])[:, 0]
+        result = played(block.model, precision, inputs[:, None])[:, 0]
         assert np.ptp(expected) > 20.0
-        assert np.abs(found - expected).max() <= ROUNDING[precision] * np.ptp(expected)
+        assert np.abs(result - expected).max() <= ROUNDING[precision] * np.ptp(expected)
 
 
 @cache
@@ -315,20 +315,20 @@ def closed_loop() -> tuple[psa.AdaptiveFeedForward, FloatArray, FloatArray]:
 def test_learning_blocks_are_the_python_objects(precision: str) -> None:
     block, inputs, voltage = closed_loop()
     limit = {"double": 1e-8, "single": 2e-4}[precision]
-    found = played(block.model, precision, inputs)
-    assert np.abs(found[:, 0] - voltage).max() <= limit * np.ptp(voltage)
+    result = played(block.model, precision, inputs)
+    assert np.abs(result[:, 0] - voltage).max() <= limit * np.ptp(voltage)
     learnt = np.array([block.estimate.parameters[n] for n in ("A", "n", "k_L")])
     names = [f"{n}_hat" for n in ("A", "n", "k_L")]
     at = [block.model.output_names.index(n) for n in names]
-    assert found[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
+    assert result[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
     online = psa.OnlineIdentification(block.model.values)
-    given = np.column_stack([voltage, inputs[:, 1]])
-    for row in given.tolist():
+    arguments = np.column_stack([voltage, inputs[:, 1]])
+    for row in arguments.tolist():
         online.step(*row)
-    found = played(online.model, precision, given)
+    result = played(online.model, precision, arguments)
     learnt = np.array([online.estimate.parameters[n] for n in ("A", "n", "k_L")])
     at = [online.model.output_names.index(n) for n in names]
-    assert found[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
+    assert result[-1, at] == pytest.approx(learnt, rel=50.0 * limit)
 
 
 @pytest.mark.parametrize(
@@ -339,13 +339,13 @@ def test_learning_blocks_are_the_python_objects(precision: str) -> None:
     ),
 )
 def test_every_part_is_c_of_small_frames_and_no_loop(name: str, precision: str) -> None:
-    found = code_of(psa.part_model(name), precision)
-    assert found.worst.error <= 1e-3
-    source = found.texts["part.c"]
+    result = code_of(psa.part_model(name), precision)
+    assert result.worst.error <= 1e-3
+    source = result.texts["part.c"]
     code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    assert found.plan.substeps > 1 or not re.search(r"\b(for|while|goto)\b", code)
+    assert result.plan.substeps > 1 or not re.search(r"\b(for|while|goto)\b", code)
     with temporary_folder() as folder:
-        for file, text in found.texts.items():
+        for file, text in result.texts.items():
             (folder / file).write_text(text, encoding="utf-8")
         for level in ("-O0", "-O2"):
             command = [*compiler_command(), *FRAMES, level, "-c", "part.c", "-o", "part.o"]
@@ -355,9 +355,9 @@ def test_every_part_is_c_of_small_frames_and_no_loop(name: str, precision: str) 
 def test_a_controller_acts_at_every_few_steps_of_its_plant() -> None:
     """A sampled part called four times a period changes its command at the fourth call."""
     part = psa.part_model("position_controller")
-    found = fixed_step(part, name="part", step=1.25e-5)
+    result = fixed_step(part, name="part", step=1.25e-5)
     u = np.column_stack([np.linspace(0.0, 1e-6, 401), np.zeros(401)])
-    command = Probe(found.plan, found.texts).play(u)[:, 0]
+    command = Probe(result.plan, result.texts).play(u)[:, 0]
     moved = np.flatnonzero(np.diff(command)) + 2  # the number of the call that changes it
     assert len(moved) > 90
     assert not np.any(moved % 4)
@@ -394,10 +394,10 @@ def test_communication_steps_are_one_step_or_several(every: int) -> None:
     times = STEP * np.arange(COUNT, dtype=np.float64)[::every]
     voltage = 100.0 * VOLTAGES["tones"][1](np.linspace(0.0, 1.0, COUNT))[::every]
     inputs = Signals(("voltage",), times, voltage[:, None])
-    found = co_simulate(exported(2), times, inputs, ("displacement",))[:, 0]
+    result = co_simulate(exported(2), times, inputs, ("displacement",))[:, 0]
     model = stack("P-885.51").plant()
     true = psa.simulate(model, times, voltage, as_exported=True, rtol=1e-8, hold="linear")
-    assert error(found, true.outputs["displacement"]) <= 5e-5
+    assert error(result, true.outputs["displacement"]) <= 5e-5
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)

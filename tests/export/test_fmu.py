@@ -221,11 +221,11 @@ def _coupled_by_ecos(ecos: Any, fmi: int, step: float) -> tuple[float, float]:
     for k in range(round(END / step)):
         simulation.set_real("stack::voltage", RATE * (k + 0.5) * step)
         simulation.step(1)
-    found = simulation.get_real("stack::x"), simulation.get_real("flexure::x_f")
+    result = simulation.get_real("stack::x"), simulation.get_real("flexure::x_f")
     simulation.terminate()
     simulation.free()
     structure.free()
-    return found
+    return result
 
 
 @VERSIONS
@@ -235,8 +235,8 @@ def test_ecos_couples_two_fmus(fmi: int) -> None:
     expected = monolithic()
     errors = []
     for step in (1e-6, 5e-7, 2.5e-7):
-        found = _coupled_by_ecos(ecos, fmi, step)
-        errors.append(max(abs(a - b) for a, b in zip(found, expected, strict=True)) / expected[0])
+        result = _coupled_by_ecos(ecos, fmi, step)
+        errors.append(max(abs(a - b) for a, b in zip(result, expected, strict=True)) / expected[0])
     assert errors[0] / errors[1] > 1.6, errors
     assert errors[1] / errors[2] > 1.6, errors
     assert errors[2] < 1e-2

@@ -63,8 +63,8 @@ def _signals(name: str, kind: str) -> Signals:
 def _expected(name: str, kind: str) -> FloatArray:
     """Return the displacement every 0.1 ms by a computation at 1e-10 or tighter."""
     model = model_named(name).plant()
-    found = expected_outputs(model, GRID, _signals(name, kind))
-    column: FloatArray = found[:, model.output_names.index("displacement")]
+    values = expected_outputs(model, GRID, _signals(name, kind))
+    column: FloatArray = values[:, model.output_names.index("displacement")]
     return column
 
 
@@ -86,8 +86,8 @@ IN_TURN = [
 def test_error_is_within_ten_tolerances(name: str, kind: str, tolerance: float) -> None:
     expected = _expected(name, kind)
     with Fmu(exported(name)) as fmu:
-        found = co_simulate(fmu, GRID, _signals(name, kind), ["displacement"], tolerance=tolerance)
-    error = np.max(np.abs(found[:, 0] - expected)) / _scale(name, expected)
+        values = co_simulate(fmu, GRID, _signals(name, kind), ["displacement"], tolerance=tolerance)
+    error = np.max(np.abs(values[:, 0] - expected)) / _scale(name, expected)
     assert error < FACTOR * tolerance
 
 
@@ -95,13 +95,13 @@ def _held(
     fmu: Fmu, points: FloatArray, sizes: FloatArray, levels: FloatArray, tolerance: float | None
 ) -> FloatArray:
     """Hold a level from each point on; return the displacement at the ends of the steps."""
-    found = []
+    items = []
     with fmu.start(CO_SIMULATION, tolerance=tolerance, start_time=float(points[0])) as slave:
         for point, size, level in zip(points, sizes, levels, strict=True):
             slave.set({"voltage": float(level)})
             slave.step(float(point), float(size))
-            found.append(slave.get(["displacement"])[0])
-    return np.array(found)
+            items.append(slave.get(["displacement"])[0])
+    return np.array(items)
 
 
 #: Within this time [s] of a constant voltage each of the stacks has come to rest.
@@ -131,8 +131,8 @@ def test_jumps_and_steps_from_a_microsecond_to_a_quarter_hour(name: str, toleran
     expected = _after_jumps(name)
     levels = model_named(name).values["u_rated"] * _SHARES
     with Fmu(exported(name)) as fmu:
-        found = _held(fmu, _sums(0.0, _SIZES), _SIZES, levels, tolerance)
-    error = np.max(np.abs(found - expected)) / _scale(name, expected)
+        result = _held(fmu, _sums(0.0, _SIZES), _SIZES, levels, tolerance)
+    error = np.max(np.abs(result - expected)) / _scale(name, expected)
     assert error < FACTOR * tolerance
 
 
@@ -162,8 +162,8 @@ def test_every_solver_step_gets_a_share_of_the_tolerance() -> None:
     with Fmu(exported(name)) as fmu, fmu.start(CO_SIMULATION, tolerance=tolerance) as instance:
         instance.require("SetDebugLogging", 1, 0, None)
         communicate(instance, times, inputs, ["displacement"])
-        told = [m for m in instance.messages if "solver steps" in m]
-    steps = sum(int(m.partition(": ")[2].split()[0]) for m in told)
+        items = [m for m in instance.messages if "solver steps" in m]
+    steps = sum(int(m.partition(": ")[2].split()[0]) for m in items)
     model = model_named(name).plant()
     u = np.zeros((len(times), len(model.input_names)))
     u[:, model.input_names.index("voltage")] = inputs.at(times)[:, 0]
@@ -171,7 +171,7 @@ def test_every_solver_step_gets_a_share_of_the_tolerance() -> None:
         model, times, u, np.zeros(len(model.state_names)),
         rtol=max(STEP_SHARE * tolerance, TIGHTEST_STEP),
     )  # fmt: skip
-    assert len(told) == len(times) - 1
+    assert len(items) == len(times) - 1
     assert steps == again.steps
 
 
@@ -215,8 +215,8 @@ def test_long_steps(fmi: int, tolerance: float | None) -> None:
             for size in (1.0, 10.0, 1e4):
                 sizes = np.full(3, size)
                 rest[start, size] = _alternating(fmu, start, sizes, tolerance)
-    found = np.array(list(rest.values()))
-    error = np.abs(found - rest[0.0, 1.0]).max() / np.ptp(found)
+    result = np.array(list(rest.values()))
+    error = np.abs(result - rest[0.0, 1.0]).max() / np.ptp(result)
     assert error < 10.0 * (tolerance or 1e-6)
     assert np.array_equal(rest[0.0, 1e4], rest[1e6, 1e4])
 
@@ -238,11 +238,11 @@ def test_sampled_states_far_from_zero(fmi: int) -> None:
         for start in (0.0, 1e6 * PERIOD, 1e9 * PERIOD):
             with fmu.start(CO_SIMULATION, tolerance=1e-9, start_time=start) as slave:
                 slave.set({"reference": 1.0})
-                found = []
+                items = []
                 for begin, end in pairwise(start + times):
                     slave.step(float(begin), float(end - begin))
-                    found.append(slave.get(["shown", "voltage"]))
-            runs.append(np.array(found))
+                    items.append(slave.get(["shown", "voltage"]))
+            runs.append(np.array(items))
     assert np.ptp(runs[0][:, 1]) > 0.05
     assert np.abs(runs[1] - runs[0]).max() < 1e-8
     assert np.abs(runs[2] - runs[0]).max() < 1e-5

@@ -100,17 +100,17 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
     texts, linux = {"model.c": "int a;"}, PLATFORMS["x86_64-linux"]
-    found = {compile_library(dict(texts), "psa", linux) for _ in range(2)}
-    found |= {
+    result = {compile_library(dict(texts), "psa", linux) for _ in range(2)}
+    result |= {
         compile_library({"model.c": "int b;"}, "psa", linux),
         compile_library(texts, "other", linux),
         compile_library(texts, "psa", PLATFORMS["aarch64-linux"]),
     }
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.version", lambda _: "99")
-    found.add(compile_library(texts, "psa", linux))
-    own = replace(linux, target=None)  # a machine's own compiler may change without a new name
-    found |= {compile_library(texts, "psa", own) for _ in range(2)}
-    assert len(found) == len(calls) == 7
+    result.add(compile_library(texts, "psa", linux))
+    item = replace(linux, target=None)  # a machine's own compiler may change without a new name
+    result |= {compile_library(texts, "psa", item) for _ in range(2)}
+    assert len(result) == len(calls) == 7
 
 
 @pytest.mark.usefixtures("without_binary")
@@ -180,10 +180,10 @@ CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("change", slow_but(["equation", "start value"], CHANGES))
 def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> None:
-    place, edit, said = CHANGES[change]
+    place, edit, statement = CHANGES[change]
     row = _reproducible(rewritten(older, tmp_path / "changed.fmu", {place: edit}))
     assert not row.passed
-    assert said in row.remark
+    assert statement in row.remark
 
 
 flexure = psa.compose([psa.COMPONENTS["flexure"]], name="flexure")
@@ -237,9 +237,9 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
         assert 0 <= top < top + height <= SIDE
         colour = [int(r.attrib["fill"][k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
         expected[top : top + height, left : left + width] = [*colour, 1.0]
-    seen = expected[..., 3] > 0.0
-    assert np.array_equal(picture[..., 3] > 0.0, seen)
-    assert picture[seen] == pytest.approx(expected[seen], abs=1e-6)
+    observed = expected[..., 3] > 0.0
+    assert np.array_equal(picture[..., 3] > 0.0, observed)
+    assert picture[observed] == pytest.approx(expected[observed], abs=1e-6)
 
 
 # Documentation
@@ -248,17 +248,17 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
 @pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
 def test_documentation_is_complete(model: psa.Model) -> None:
     page = documentation(model)
-    said = html.unescape(re.sub(r"<[^>]*>", "\n", page))
+    statement = html.unescape(re.sub(r"<[^>]*>", "\n", page))
     for component in model.components:
         for text in (component.name, component.description, component.equation_text):
-            assert text in said, component.name
-        assert component.source in said
+            assert text in statement, component.name
+        assert component.source in statement
     for declared in variable_table(model):
         if declared.kind in ("parameter", "input", "output", "state"):
             assert f"<td>{declared.name}</td>" in page
-            assert declared.description in said
+            assert declared.description in statement
     for switch in model.structure.switches:
-        assert f"switch.{switch}" in said
+        assert f"switch.{switch}" in statement
 
 
 def test_documentation_stands_alone() -> None:
@@ -291,12 +291,12 @@ def test_kinds_of_dependence() -> None:
         inputs=(psa.Input("v", "V", "voltage"), psa.Input("w", "1", "share")),
         outputs=(psa.Output("y", "V", "scaled"), psa.Output("z", "m", "shown")),
     )  # fmt: skip
-    found = dependencies(psa.compose([part]).structure)
+    result = dependencies(psa.compose([part]).structure)
     state, v, w, a = ("state", 0), ("input", 0), ("input", 1), ("parameter", 0)
     rate = {state: "dependent", v: "constant", w: "dependent", a: "dependent"}
-    assert found["derivative", 0] == rate
-    assert found["output", 0] == {v: "tunable", a: "dependent"}
-    assert found["output", 1] == {state: "constant"}
+    assert result["derivative", 0] == rate
+    assert result["output", 0] == {v: "tunable", a: "dependent"}
+    assert result["output", 1] == {state: "constant"}
 
 
 Table = Mapping[str, FloatArray]
@@ -331,8 +331,8 @@ def test_manifest_lists_every_file_as_the_schema_of_the_standard_has_it(fmi: int
         assert set(related.attrib) == {"type", "source", "role", "description"}
         assert path in inside
         roles[path] = related.attrib["role"]
-    own = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
-    assert set(roles) == {*own, NOTES}
+    item = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
+    assert set(roles) == {*item, NOTES}
     assert roles[f"{FOLDER}/{EXPERIMENTS}"] == "experiment/smoke-test"
     assert roles[f"{FOLDER}/{PARAMETERS}"] == "parameter"
     assert roles[f"{FOLDER}/{OUTPUTS}"] == "result"
@@ -358,8 +358,8 @@ def test_reference_outputs_agree_with_the_independent_reference(name: str) -> No
     times = kinks.pop("time")
     signals = Signals(tuple(kinks), times, np.column_stack(list(kinks.values())))
     truth = expected_outputs(model, outputs["time"], signals)
-    for column, (output, found) in zip(truth.T, list(outputs.items())[1:], strict=True):
-        assert np.max(np.abs(column - found)) < 1e-6 * np.ptp(found), output
+    for column, (output, result) in zip(truth.T, list(outputs.items())[1:], strict=True):
+        assert np.max(np.abs(column - result)) < 1e-6 * np.ptp(result), output
 
 
 @pytest.mark.usefixtures("without_binary")
@@ -429,8 +429,8 @@ def test_a_licence_that_was_lost_is_found(tmp_path: Path) -> None:
     path = tmp_path / "m.fmu"
     gone = {LICENSE_ENTRY: lambda _: b"all rights reserved\n"}
     with Archive(rewritten(exported("flexure", 2), path, gone)) as archive:
-        (found,) = missing_notices(archive)
-    assert "lacks the notice 'Copyright (c)" in found
+        (result,) = missing_notices(archive)
+    assert "lacks the notice 'Copyright (c)" in result
     unsaid = {"modelDescription.xml": lambda xml: re.sub(rb' license="[^"]*"', b"", xml)}
     with Archive(rewritten(exported("flexure", 2), path, unsaid)) as archive:
         assert list(missing_notices(archive)) == ["the description states no license"]

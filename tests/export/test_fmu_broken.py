@@ -38,8 +38,8 @@ KINDS = "tunable tunable dependent dependent dependent"
 def _unknown(fmi: int, name: str, *knowns: str, kinds: str) -> str:
     """Return how the description lists the dependencies of an output."""
     places = " ".join(str(PLACES[n]) for n in knowns)
-    own = "index" if fmi == 2 else "valueReference"
-    return f'{own}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
+    item = "index" if fmi == 2 else "valueReference"
+    return f'{item}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
 
 
 def _dependency(
@@ -176,9 +176,9 @@ _OUTPUTS: dict[bytes, FloatArray] = {}
 def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
     edit, rows, remark = DESCRIPTIONS[fault]
     changes = {XML: _edit(*edit(fmi))}
-    found = _failures(psa.check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
-    assert set(found) == rows | {ALWAYS}, found
-    assert any(remark in found[row] for row in rows), found
+    result = _failures(psa.check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
+    assert set(result) == rows | {ALWAYS}, result
+    assert any(remark in result[row] for row in rows), result
 
 
 #: Faults that share a binary, as each has a row that none of the others in it fails: file, text,
@@ -230,8 +230,8 @@ def test_wrong_sources(faults: str, tmp_path: Path) -> None:
         edits[file] = (*edits.get(file, ()), (old, new))
     report = psa.check_fmu(recompiled(tmp_path / "b.fmu", 2, edits))
     assert report.compared
-    found = set(_failures(report))
-    assert all(rows <= found for *_, rows in CORE[faults]), found
+    result = set(_failures(report))
+    assert all(rows <= result for *_, rows in CORE[faults]), result
 
 
 #: Faults of the FMI 3.0 face that share a binary, as each has a row of its own.
@@ -262,19 +262,19 @@ MISSING = {
 @slow
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
-    found = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
-    assert {"adjoint derivatives", "life cycle", "event indicators"} == set(found), found
-    assert "stays negative after an event" in found["event indicators"]
+    result = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
+    assert {"adjoint derivatives", "life cycle", "event indicators"} == set(result), result
+    assert "stays negative after an event" in result["event indicators"]
 
 
 @slow
 @harmless
 def test_a_function_under_another_name(tmp_path: Path) -> None:
-    found = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, MISSING)))
-    assert {"functions present", "no other symbols", "binary loads"} == set(found), found
-    assert "fmi3ActivateModelPartition is missing" in found["functions present"]
-    assert "fmi3ActivateModelPartitions is exported" in found["no other symbols"]
-    assert "fmi3ActivateModelPartition" in found["binary loads"]
+    result = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, MISSING)))
+    assert {"functions present", "no other symbols", "binary loads"} == set(result), result
+    assert "fmi3ActivateModelPartition is missing" in result["functions present"]
+    assert "fmi3ActivateModelPartitions is exported" in result["no other symbols"]
+    assert "fmi3ActivateModelPartition" in result["binary loads"]
 
 
 @slow
@@ -297,9 +297,9 @@ def test_binaries_that_cannot_be_used(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", PLATFORMS)
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_binaries_of_all_platforms_are_inspected(name: str, fmi: int) -> None:
-    found = read_binary(binary(fmi, PLATFORMS[name]))
-    assert (found.platform, found.exports) == (name, FUNCTIONS[fmi])
-    assert any(n.startswith("GLIBC_2.") for n in found.needs) == name.endswith("linux")
+    result = read_binary(binary(fmi, PLATFORMS[name]))
+    assert (result.platform, result.exports) == (name, FUNCTIONS[fmi])
+    assert any(n.startswith("GLIBC_2.") for n in result.needs) == name.endswith("linux")
 
 
 def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,8 +309,8 @@ def test_without_lief_the_binaries_are_not_inspected(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(check, "rows_apart", lambda *_: [])
     report = psa.check_fmu(exported(STACK, 2))
     assert report.left_out == OF_BINARIES
-    said = check_sentence(report)
-    assert "Left out, as lief is not installed (`pip install lief`): functions present" in said
+    text = check_sentence(report)
+    assert "Left out, as lief is not installed (`pip install lief`): functions present" in text
 
 
 @pytest.mark.skipif(host_platform().suffix != ".so", reason="patches the names of an ELF file")
@@ -353,11 +353,11 @@ def test_what_the_compiler_of_the_system_makes_passes(
 @pytest.mark.parametrize("fmi", VERSIONS)
 def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) -> None:
     """Importers go by the folder alone, and would fail to load it."""
-    path, found = tmp_path / "b.fmu", entries(STACK, fmi)
-    write_archive(path, {**found, "binaries/riscv64-linux/psa.so": found[_binary(fmi)]})
+    path, result = tmp_path / "b.fmu", entries(STACK, fmi)
+    write_archive(path, {**result, "binaries/riscv64-linux/psa.so": result[_binary(fmi)]})
     with Archive(path) as moved:
-        (said,) = binaries.misplaced_binaries(moved)
-    assert said.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
+        (statement,) = binaries.misplaced_binaries(moved)
+    assert statement.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
     with Archive(exported(STACK, fmi)) as whole:
         assert not list(binaries.misplaced_binaries(whole))
 
@@ -367,10 +367,10 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
 def test_sources_and_model_that_are_not_those_of_the_binary(tmp_path: Path) -> None:
     path, fmi = tmp_path / "b.fmu", 2
     change = _edit("\n", "\n\n")
-    found = _failures(
+    result = _failures(
         psa.check_fmu(rewritten(exported(STACK, fmi), path, {"sources/solver.c": change}))
     )
-    assert found == {ALWAYS: "sources/solver.c differs"}
+    assert result == {ALWAYS: "sources/solver.c differs"}
     lost = {n: c for n, c in entries(STACK, fmi).items() if n != "sources/linear.c"}
     write_archive(path, lost)
     assert "sources/linear.c is missing" in _failures(psa.check_fmu(path))[ALWAYS]
@@ -413,9 +413,9 @@ def test_names_are_judged_as_by_the_grammar_of_fmpy() -> None:
         variableNamingConvention="structured",
         modelVariables=[SimpleNamespace(name=n, sourceline=1) for n in NAMES],
     )
-    found = " ".join(_validate_variable_names(made))
+    text = " ".join(_validate_variable_names(made))
     assert [n for n in NAMES if not description._NAMES["structured"].fullmatch(n)] == [
-        n for n in NAMES if f'"{n}" (line 1) is not a legal' in found
+        n for n in NAMES if f'"{n}" (line 1) is not a legal' in text
     ]
 
 
@@ -427,11 +427,11 @@ def test_many_variables_take_little_time_each(tmp_path: Path) -> None:
     end = "</ModelVariables>"
     path = rewritten(exported(STACK, 2), tmp_path / "m.fmu", {XML: _edit(end, more + end)})
     with Archive(path) as archive:
-        begun = time.process_time()
-        found = list(description.invalid(archive))
-        assert time.process_time() - begun < 10.0
-    assert len(found) == 1
-    assert found[0].startswith("'no name' (line ")
+        started = time.process_time()
+        items = list(description.invalid(archive))
+        assert time.process_time() - started < 10.0
+    assert len(items) == 1
+    assert items[0].startswith("'no name' (line ")
 
 
 def test_the_time_of_a_check_is_that_of_all_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:

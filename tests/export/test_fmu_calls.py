@@ -65,11 +65,13 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
             done = try_step(slave, 1e-3, 1e-3)
             assert done.status == DISCARD
             reached.value = done.time
-        said = re.fullmatch(r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1])
-        assert said is not None
-        assert said[2] in fmu.states()
+        statement = re.fullmatch(
+            r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1]
+        )
+        assert statement is not None
+        assert statement[2] in fmu.states()
         assert 1e-3 <= reached.value < 2e-3
-        assert float(said[1]) == pytest.approx(reached.value, rel=1e-8)
+        assert float(statement[1]) == pytest.approx(reached.value, rel=1e-8)
         with pytest.raises(FmuError) as refused:
             slave.step(reached.value, 1e-3)
         assert refused.value.status == ERROR
@@ -87,9 +89,9 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
 )
 def test_an_absurd_input_ends_the_step_soon(name: str, value: float, older: Instance) -> None:
     older.set({name: value})
-    begun = time.process_time()
+    started = time.process_time()
     assert older.call("DoStep", 0.0, 1e-3, 1) == DISCARD
-    assert time.process_time() - begun < 0.5
+    assert time.process_time() - started < 0.5
     assert "an input or a parameter is far from its physical range" in older.messages[-1]
 
 
@@ -158,13 +160,13 @@ def test_wrong_token_and_missing_name_give_no_instance(
 def test_what_the_model_does_not_have_gives_no_instance() -> None:
     with pytest.raises(FmuError, match="no instance"):
         loaded(STACK).open(CO_SIMULATION, requiredIntermediateVariables=[10**6])
-    fmu, said = loaded(STACK), list[bytes]()
+    fmu, statement = loaded(STACK), list[bytes]()
     other = FMU3ScheduledExecution(
         guid=fmu.token, modelIdentifier=fmu.identifier, unzipDirectory=str(fmu.directory)
     )
     with pytest.raises(Exception, match="Failed to instantiate"):
-        other.instantiate(logMessage=lambda *told: said.append(told[-1]))
-    assert b"no scheduled execution" in said[-1]
+        other.instantiate(logMessage=lambda *output: statement.append(output[-1]))
+    assert b"no scheduled execution" in statement[-1]
 
 
 def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
@@ -217,10 +219,10 @@ def test_what_the_model_does_not_have_is_refused_with_the_reason(slave: Instance
 
 
 def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instance3) -> None:
-    seen: list[tuple[Update, float]] = []
+    observed: list[tuple[Update, float]] = []
 
     def watcher(instance: Instance3, update: Update) -> None:
-        seen.append((update, float(instance.get(["displacement"])[0])))
+        observed.append((update, float(instance.get(["displacement"])[0])))
         assert instance.get(["time"])[0] == update.time
         assert np.isfinite(instance.output_rates(["displacement"])).all()
         assert instance.call("Reset") == ERROR
@@ -230,14 +232,14 @@ def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instan
         for instance in (slave, watched):
             instance.set({"voltage": 50.0})
             assert instance.try_step(0.0, 1e-3).status == OK
-        times = [u.time for u, _ in seen]
+        times = [u.time for u, _ in observed]
         assert len(times) > 5
         assert np.all(np.diff(times) > 0.0)
         assert times[-1] == pytest.approx(1e-3)
-        assert all(u.get_allowed and u.step_finished for u, _ in seen)
-        assert [u.can_return_early for u, _ in seen] == [True] * (len(seen) - 1) + [False]
-        assert [u.set_requested for u, _ in seen] == [True] * (len(seen) - 1) + [False]
-        path = [d for _, d in seen]
+        assert all(u.get_allowed and u.step_finished for u, _ in observed)
+        assert [u.can_return_early for u, _ in observed] == [True] * (len(observed) - 1) + [False]
+        assert [u.set_requested for u, _ in observed] == [True] * (len(observed) - 1) + [False]
+        path = [d for _, d in observed]
         assert 0.0 < path[0] < path[-1]
         assert slave.get(OUTPUTS).tobytes() == watched.get(OUTPUTS).tobytes()
         assert slave.serialized() == watched.serialized()
@@ -245,12 +247,12 @@ def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instan
 
 @pytest.mark.parametrize("late", [0.0, 1e-4])
 def test_early_return_is_honoured_where_it_was_allowed(late: float) -> None:
-    asked: list[float] = []
+    numbers: list[float] = []
 
     def watcher(_: Instance3, update: Update) -> float | None:
-        if update.time > 3e-4 and not asked:
-            asked.append(update.time + late)
-            return asked[0]
+        if update.time > 3e-4 and not numbers:
+            numbers.append(update.time + late)
+            return numbers[0]
         return None
 
     with Instance3(loaded(STACK), watcher=watcher) as slave, Instance3(loaded(STACK)) as plain:
@@ -258,19 +260,19 @@ def test_early_return_is_honoured_where_it_was_allowed(late: float) -> None:
             instance.start({"voltage": 50.0})
         done = slave.try_step(0.0, 1e-3)
         assert (done.status, done.early) == (OK, True)
-        assert done.time == asked.pop()
-        asked.append(done.time)
+        assert done.time == numbers.pop()
+        numbers.append(done.time)
         slave.step(done.time, 1e-3 - done.time)
         plain.step(0.0, 1e-3)
         both = [instance.get(["time", "displacement", "charge"]) for instance in (slave, plain)]
         assert both[0] == pytest.approx(both[1], rel=1e-5)
-    asked.clear()
+    numbers.clear()
     with Instance3(loaded(STACK), early=False, watcher=watcher) as slave:
         slave.start({"voltage": 50.0})
         done = slave.try_step(0.0, 1e-3)
         assert (done.status, done.early) == (OK, False)
         assert done.time == pytest.approx(1e-3)
-        assert asked
+        assert numbers
 
 
 def test_input_set_in_an_intermediate_update_holds_from_there_on() -> None:
@@ -341,10 +343,13 @@ def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Insta
     assert struct.unpack("<d", data[32:40])[0] == slave.get(["time"])[0]
     foreign, damaged = "another model, version or kind of machine", "damaged"
     flips = {0: foreign, 8: foreign, 16: foreign, 40: damaged, len(data) - 1: damaged}
-    broken = [(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], said) for k, said in flips.items()]
-    for wrong, said in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
+    broken = [
+        (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], statement)
+        for k, statement in flips.items()
+    ]
+    for wrong, statement in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
         assert slave.try_restore(wrong) == ERROR
-        assert said in slave.messages[-1]
+        assert statement in slave.messages[-1]
     with Instance3(slave.fmu, MODEL_EXCHANGE) as exchange:
         assert exchange.try_restore(data) == ERROR
         assert "other interface" in exchange.messages[-1]
@@ -407,7 +412,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     path = exported(STACK) if model == "stack" else exported("loop", 3)
     moved = "voltage" if model == "stack" else "reference"
     refused: dict[tuple[int, bytes], int] = {}
-    said, slowest = set(), 0.0
+    statement, slowest = set(), 0.0
     with Fmu(path) as fmu, fmu.start(CO_SIMULATION) as instance:
         data = _saved(instance, moved)
         assert _forged(data, 0, data[STAMP : STAMP + 8]) == data
@@ -421,7 +426,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
                     continue
                 instance.restore(snapshot)
                 instance.drop(snapshot)
-                said.add(_use(instance, moved))
+                statement.add(_use(instance, moved))
                 slowest = max(slowest, time.monotonic() - begin)
         snapshot = instance.deserialize(data)
         instance.restore(snapshot)
@@ -430,7 +435,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     states = range(3, 3 + len(fmu.states()))
     assert {(w, c) for w in states for c in (WORDS[0], WORDS[3])} <= set(refused)
     assert set(refused.values()) == {ERROR}
-    assert all(len(text) > 60 for text in said - {""})
+    assert all(len(text) > 60 for text in statement - {""})
     assert slowest < 5.0
 
 
@@ -485,8 +490,8 @@ def test_a_parameter_out_of_its_bounds_is_refused(fmi: int, interface: int) -> N
         for initialised in (False, True):
             if initialised:
                 instance.setup()
-            said = r"'m_B' cannot be set to -0\.001: it must be at least 1e-09"
-            with pytest.raises(FmuError, match=said) as refusal:
+            text = r"'m_B' cannot be set to -0\.001: it must be at least 1e-09"
+            with pytest.raises(FmuError, match=text) as refusal:
                 instance.set({"tau": 2e-4, "m_B": -0.001})
             assert refusal.value.status == ERROR
             with pytest.raises(FmuError, match=r"'n' cannot be set to 4\.1: it must be at most 4"):

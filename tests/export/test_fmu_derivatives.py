@@ -96,7 +96,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
     with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
         instance.start()
         for kind in ("Directional", "Adjoint"):
-            for unknown, known, said in (
+            for unknown, known, statement in (
                 ("u", "voltage", "'u' is not calculated"),
                 ("voltage", "u", "'voltage' is not calculated"),
                 ("current", "charge", "'charge' is calculated and cannot be varied"),
@@ -104,7 +104,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
                 vectors = (instance.references([unknown]), one, instance.references([known]), one)
                 status = instance.call(f"Get{kind}Derivative", *vectors, value, one, value, one)
                 assert status == ERROR
-                assert said in instance.messages[-1]
+                assert statement in instance.messages[-1]
             status = instance.call(f"Get{kind}Derivative", *vectors, value, c_size_t(2), value, one)
             assert status == ERROR
             assert "scalars" in instance.messages[-1]
@@ -219,9 +219,9 @@ def a_point(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def blocks(f: ca.Function, model: Model) -> dict[str, FloatArray]:
     """Return d(ode, y)/d(x), /d(u), /d(p) at the point, block by block."""
-    found = f.jacobian()(*a_point(model), 0, 0)
+    result = f.jacobian()(*a_point(model), 0, 0)
     names = ("ode by x", "ode by u", "ode by p", "y by x", "y by u", "y by p")
-    return {n: np.array(ca.densify(block)) for n, block in zip(names, found, strict=True)}
+    return {n: np.array(ca.densify(block)) for n, block in zip(names, result, strict=True)}
 
 
 def by_expression(f: ca.Function, model: Model) -> FloatArray:
@@ -238,11 +238,11 @@ def by_expression(f: ca.Function, model: Model) -> FloatArray:
 )
 def test_jacobians(name: str, fmi: int, tmp_path: Path) -> None:
     model = model_named(name).plant()
-    expected, found = (blocks(f, model) for f in (symbolic(model), imported(name, fmi, tmp_path)))
-    assert set(found) == set(expected)
+    expected, result = (blocks(f, model) for f in (symbolic(model), imported(name, fmi, tmp_path)))
+    assert set(result) == set(expected)
     for block, entries in expected.items():
         assert block == "y by u" or np.any(entries), block
-        assert found[block] == pytest.approx(entries, rel=1e-10, abs=0.0), block
+        assert result[block] == pytest.approx(entries, rel=1e-10, abs=0.0), block
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

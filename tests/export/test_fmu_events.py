@@ -85,7 +85,7 @@ def errors(
     model = model_named(name)
     volts = model.values["u_rated"] * np.array(shares)
     signal = np.array(list(zip(times, volts, strict=True)), [("time", float), ("voltage", float)])
-    found = fmpy.simulate_fmu(
+    result = fmpy.simulate_fmu(
         str(exported(name, fmi)), fmi_type="ModelExchange", stop_time=times[-1],
         output_interval=interval, input=signal, record_events=False, solver="CVode",
         output=["displacement", "velocity"],
@@ -93,11 +93,11 @@ def errors(
     t = np.array(times)
     jumps = t[1:][np.diff(t) == 0.0]
     t[:-1][np.diff(t) == 0.0] -= 1e-12
-    grid = np.unique(np.concatenate([found["time"], t, jumps]))
+    grid = np.unique(np.concatenate([result["time"], t, jumps]))
     true = psa.simulate(model.plant(), grid, np.interp(grid, t, volts), rtol=1e-9, as_exported=True)
-    at = np.searchsorted(grid, found["time"])
+    at = np.searchsorted(grid, result["time"])
     return {
-        n: float(np.max(np.abs(found[n] - true.outputs[n][at])) / np.ptp(true.outputs[n]))
+        n: float(np.max(np.abs(result[n] - true.outputs[n][at])) / np.ptp(true.outputs[n]))
         for n in ("displacement", "velocity")
     }
 
@@ -112,23 +112,23 @@ def errors(
 )  # fmt: skip
 def test_a_ramp_in_fmpy_at_its_default_tolerance(name: str, fmi: int, interval: float) -> None:
     """Each step of CVode was a jump to it: it gave up, or the velocity erred by its range."""
-    found = errors(name, fmi, [0.0, 0.1, 0.2], [0.0, 0.8, 0.0], interval)
-    assert found["displacement"] < 3e-4
-    assert found["velocity"] < 0.03
+    result = errors(name, fmi, [0.0, 0.1, 0.2], [0.0, 0.8, 0.0], interval)
+    assert result["displacement"] < 3e-4
+    assert result["velocity"] < 0.03
 
 
 @pytest.mark.parametrize("name", slow_but(["demo"], [STACK, "PTBS200", "demo", "slow_creep"]))
 def test_a_jump_in_fmpy_at_its_default_tolerance(name: str) -> None:
     """The tolerance of a velocity is a tenth of what it was, and 33 % of its range were wrong."""
-    found = errors(name, 2, [0.0, 2e-3, 2e-3, 0.02], [0.0, 0.0, 0.8, 0.8], 1e-4)
-    assert found["displacement"] < 1e-3
-    assert found["velocity"] < 0.05
+    result = errors(name, 2, [0.0, 2e-3, 2e-3, 0.02], [0.0, 0.0, 0.8, 0.8], 1e-4)
+    assert result["displacement"] < 1e-3
+    assert result["velocity"] < 0.05
 
 
-def rates(fmi: int, asked: str, *, jump: bool = False, last: float | None = None) -> FloatArray:
+def rates(fmi: int, text: str, *, jump: bool = False, last: float | None = None) -> FloatArray:
     """Return the derivatives at 2 ms of an importer that gave 10 V at 0 and 30 V at 1 ms.
 
-    Where it gave them it `asked` for the "indicators", the "rates" or both; `jump` is an event at
+    Where it gave them it `text` for the "indicators", the "rates" or both; `jump` is an event at
     1 ms, `last` is what it gives at 2 ms.
     """
     rate = "GetDerivatives" if fmi == 2 else "GetContinuousStateDerivatives"
@@ -140,7 +140,7 @@ def rates(fmi: int, asked: str, *, jump: bool = False, last: float | None = None
             instance.set({"voltage": volts})
             if jump and time > 0.0:
                 instance.require("EnterContinuousTimeMode")
-            for what in asked.split(" and "):
+            for what in text.split(" and "):
                 if what == "rates":
                     instance.vector(rate, len(fmu(fmi).states()))
                 elif what == "indicators":
@@ -156,8 +156,8 @@ def test_who_asks_for_rates_where_inputs_are_given_has_them_held(fmi: int) -> No
     """CasADi, Euler's method, masters that hold inputs: values are what they were set to."""
     held, moved = (rates(fmi, "rates", last=v) for v in (30.0, 50.0))
     assert not np.array_equal(held, moved)
-    for asked in ("rates", "indicators and rates", "rates and indicators", "nothing"):
-        assert np.array_equal(rates(fmi, asked), held), asked
+    for requested in ("rates", "indicators and rates", "rates and indicators", "nothing"):
+        assert np.array_equal(rates(fmi, requested), held), requested
     assert np.array_equal(rates(fmi, "indicators", jump=True), held)
     assert np.array_equal(rates(fmi, "indicators", last=30.0), held)
     np.testing.assert_allclose(rates(fmi, "indicators"), moved, rtol=1e-12)
@@ -165,10 +165,10 @@ def test_who_asks_for_rates_where_inputs_are_given_has_them_held(fmi: int) -> No
 
 def _named_step(fmi: int) -> float:
     page = html.unescape(entries(STACK, fmi)["documentation/index.html"].decode())
-    found = re.search(r"a step of (\S+) s keeps the error to (\S+) % of", " ".join(page.split()))
-    assert found is not None
-    assert float(found[2]) <= 100.0 * SHARE
-    return float(found[1])
+    result = re.search(r"a step of (\S+) s keeps the error to (\S+) % of", " ".join(page.split()))
+    assert result is not None
+    assert float(result[2]) <= 100.0 * SHARE
+    return float(result[1])
 
 
 @slow
@@ -181,10 +181,10 @@ def test_the_step_on_the_page_keeps_the_fmu_within_a_thousandth_and_twice_it_doe
 
     def displacement(step: float, *, held: bool) -> FloatArray:
         grid = np.linspace(0.0, times[-1], round(times[-1] / step) + 1)
-        given = replace(kinks.on(grid), held=held)
+        arguments = replace(kinks.on(grid), held=held)
         with Fmu(exported(STACK, 2 if not held else fmi)) as fmu:
-            found = co_simulate(fmu, grid, given, ["displacement"], settled=True)
-        return np.interp(times, grid, found[:, 0])
+            values = co_simulate(fmu, grid, arguments, ["displacement"], settled=True)
+        return np.interp(times, grid, values[:, 0])
 
     truth = displacement(float(times[1]), held=False)
     step, span = _named_step(fmi), float(np.ptp(truth))
@@ -206,8 +206,8 @@ def test_a_sine_over_the_whole_range_needs_the_steps_that_the_page_names(
     truth = psa.run(model, grid, u, at_rest, rtol=1e-8).y[:, column]
     for every, limits in ((1, (0.25, 1.0)), (2, (1.0, 2.5))):
         rows = slice(None, None, every)
-        found = psa.run(model, grid[rows], u[rows], at_rest, rtol=1e-8, hold="zero").y[:, column]
-        error = np.abs(found - truth[rows]).max() / np.ptp(truth)
+        result = psa.run(model, grid[rows], u[rows], at_rest, rtol=1e-8, hold="zero").y[:, column]
+        error = np.abs(result - truth[rows]).max() / np.ptp(truth)
         assert limits[0] * SHARE < error <= limits[1] * SHARE, (every, error)
 
 
@@ -233,21 +233,21 @@ def truth() -> dict[float, float]:
 def _run(slave: Instance, count: int, first: int = 0, end: int | None = None) -> FloatArray:
     """Hold samples of the signal over steps; return the displacements at their ends."""
     times = np.linspace(0.0, END, count + 1)
-    found = []
+    items = []
     for begin, stop in pairwise(times[first : end and end + 1]):
         slave.set({"voltage": float(_signal(begin))})
         slave.step(float(begin), float(stop - begin))
-        found.append(slave.get(["displacement"])[0])
-    return np.array(found)
+        items.append(slave.get(["displacement"])[0])
+    return np.array(items)
 
 
 def _error(fmu: Fmu, count: int, line: float, truth: dict[float, float]) -> float:
     """Return the largest error over the second period, as a share of the range."""
     with fmu.start(CO_SIMULATION, tolerance=1e-8, values={"input_line": line}) as slave:
-        found = _run(slave, count)
+        result = _run(slave, count)
     ends = np.round(np.linspace(0.0, END, count + 1)[1:], 9)
     known = np.array([truth[t] for t in ends.tolist()])
-    return float(np.abs(found - known)[count // 2 :].max() / np.ptp(list(truth.values())))
+    return float(np.abs(result - known)[count // 2 :].max() / np.ptp(list(truth.values())))
 
 
 @VERSIONS
@@ -271,11 +271,11 @@ def test_a_value_that_is_not_set_again_is_held(fmi: int) -> None:
                 _run(slave, 200, end=20)
                 last = float(_signal(np.array(19 * END / 200)))
                 slave.set({"voltage": 40.0})
-                found = []
+                items = []
                 for k in range(4):
                     slave.step(20 * END / 200 + k * 0.2, 0.2)
-                    found.append(slave.get(["voltage"])[0])
-            assert found == pytest.approx([40.0 + line * (40.0 - last), 40.0, 40.0, 40.0])
+                    items.append(slave.get(["voltage"])[0])
+            assert items == pytest.approx([40.0 + line * (40.0 - last), 40.0, 40.0, 40.0])
 
 
 @VERSIONS
@@ -300,9 +300,11 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
             with pytest.raises(FmuError, match="'input_line' can be set only before the first"):
                 other.set({"input_line": 0.0})
         with fmu.open(CO_SIMULATION) as other:
-            with pytest.raises(FmuError, match="'input_line' cannot be set to 2: it must") as told:
+            with pytest.raises(
+                FmuError, match="'input_line' cannot be set to 2: it must"
+            ) as output:
                 other.set({"input_line": 2.0})
-            assert told.value.status == ERROR
+            assert output.value.status == ERROR
 
 
 def test_a_jump_in_event_mode_starts_a_new_line() -> None:

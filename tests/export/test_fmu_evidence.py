@@ -40,37 +40,37 @@ from tests.tiers import slow, slow_but
 
 def stated() -> Evidence:
     """Return the evidence of the model."""
-    found = evident_model().evidence
-    assert found is not None
-    return found
+    result = evident_model().evidence
+    assert result is not None
+    return result
 
 
 def test_experiments_name_files_that_are_there() -> None:
-    found = files_inside(evident_fmu())
-    (whole,) = ET.fromstring(found[evidence.VALIDATION])
-    spread = ET.fromstring(found[evidence.UNCERTAINTY])
+    table = files_inside(evident_fmu())
+    (whole,) = ET.fromstring(table[evidence.VALIDATION])
+    spread = ET.fromstring(table[evidence.UNCERTAINTY])
     assert [e.tag for e in whole] == ["Parameters", "Stimuli", "References"]
     assert len(spread) == 1 + 2 * 3 + 2  # the mean, pairs of three parameters, two samples
     for experiment in (whole, *spread):
-        assert all(f"{FOLDER}/{e.attrib['source']}" in found for e in experiment)
-    for name in (n for n in found if n.endswith(".ssv")):
-        assert_valid(found[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
-        root = ET.fromstring(found[name])
-        told = {
+        assert all(f"{FOLDER}/{e.attrib['source']}" in table for e in experiment)
+    for name in (n for n in table if n.endswith(".ssv")):
+        assert_valid(table[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
+        root = ET.fromstring(table[name])
+        output = {
             p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
         }
-        assert {*told.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
-        own = {p.name: p.unit for p in evident_model().structure.parameters if p.name in told}
-        assert own.items() <= told.items()
-        assert own
-    one = found[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
+        assert {*output.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
+        item = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
+        assert item.items() <= output.items()
+        assert item
+    one = table[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
 
 def test_meta_data_and_page_say_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
-    found = files_inside(evident_fmu())
-    root = ET.fromstring(found[evidence.META_DATA])
+    table = files_inside(evident_fmu())
+    root = ET.fromstring(table[evidence.META_DATA])
     space = "{http://ssp-standard.org/SSPTraceability1/%s}"
     assert root.tag == space % "SimulationResourceMetaData" + "SimulationResourceMetaData"
     assert set(root.attrib) == {"version", "name", "generationTool"}
@@ -81,7 +81,7 @@ def test_meta_data_and_page_say_the_same() -> None:
         for entry in part:
             assert entry.tag == space % "SSPTraceabilityCommon" + "ClassificationEntry"
             entries.setdefault(entry.attrib["keyword"], []).append(entry.text or "")
-    page, held = found[evidence.PAGE].decode(), stated().held_out
+    page, held = table[evidence.PAGE].decode(), stated().held_out
     assert held is not None
     (record,) = entries["record"]
     assert noisy_record().sha256 in record
@@ -93,7 +93,7 @@ def test_meta_data_and_page_say_the_same() -> None:
     for keyword in ("record", "held-out error", "voltage", "duration", "k_L"):
         assert entries[keyword][0] in page
     assert all(link in ("index.html",) for link in re.findall(r'href="([^"]*)"', page))
-    assert "../documentation/evidence.html" in found["documentation/index.html"].decode()
+    assert "../documentation/evidence.html" in table["documentation/index.html"].decode()
 
 
 def test_a_model_without_evidence_has_no_such_files() -> None:
@@ -105,13 +105,13 @@ def test_a_model_without_evidence_has_no_such_files() -> None:
 
 def test_what_a_person_says_of_a_record_stays_text() -> None:
     """A record's name may hold what means something in HTML and XML."""
-    model, told = evident_model().plant(), stated()
-    assert told.reference is not None
+    model, output = evident_model().plant(), stated()
+    assert output.reference is not None
     name = "<b>&\"'"
     odd = replace(
-        told,
-        runs=(replace(told.runs[0], record=name),),
-        reference=replace(told.reference, record=name),
+        output,
+        runs=(replace(output.runs[0], record=name),),
+        reference=replace(output.reference, record=name),
     )
     texts = evidence.evidence_texts(replace(model, evidence=odd), 0)
     assert "&lt;b&gt;&amp;" in texts[evidence.PAGE]
@@ -125,12 +125,12 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
-    said = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
-    assert "documentation/evidence.html (records: short), 8 parameter sets" in said
-    found = files_inside(path)
+    statement = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in statement
+    table = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
-        assert found[f"{evidence.SETS}/{file.name}"] == file.read_bytes()
+        assert table[f"{evidence.SETS}/{file.name}"] == file.read_bytes()
     with Fmu(path) as fmu:  # with the sensor, whose reading is compared then
         playback = repeated(fmu, evident_model(), [noisy_record()])[-1]
         assert isinstance(playback, Playback)
@@ -149,21 +149,21 @@ def messages(
     volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
     inputs = Signals(("voltage",), times, volts[:, None])
     with Fmu(evident_fmu(fmi)) as fmu, fmu.start(CO_SIMULATION, start_time=start) as instance:
-        found = communicate(instance, times, inputs, [OUTPUT])
-        return [m for m in instance.messages if _SAID in m], found[:, 0]
+        values = communicate(instance, times, inputs, [OUTPUT])
+        return [m for m in instance.messages if _SAID in m], values[:, 0]
 
 
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_inside_nothing_is_said(fmi: int) -> None:
-    said, outside = messages(fmi, 75.0, 0.5, start=1e3)
-    assert said == []
+    statement, outside = messages(fmi, 75.0, 0.5, start=1e3)
+    assert statement == []
     assert np.all(outside == 0.0)
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
-    said, outside = messages(fmi, 120.0, 0.6)
-    (line,) = said
+    statement, outside = messages(fmi, 120.0, 0.6)
+    (line,) = statement
     assert line.startswith("voltage is 7")
     low, high = stated().seen.voltage.low, stated().seen.voltage.high
     assert f"from {low:.6g} to {high:.6g}." in line
@@ -175,22 +175,22 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
 @slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
-    said, outside = messages(fmi, 75.0, 0.01)
-    assert len(said) == 1
-    assert said[0].startswith("The rate per second of voltage is 1")
+    statement, outside = messages(fmi, 75.0, 0.01)
+    assert len(statement) == 1
+    assert statement[0].startswith("The rate per second of voltage is 1")
     assert np.max(outside) > 1.0
-    said, outside = messages(fmi, 75.0, 0.8)
-    assert len(said) == 1
-    assert said[0].startswith("The time since the start is 0.64")
+    statement, outside = messages(fmi, 75.0, 0.8)
+    assert len(statement) == 1
+    assert statement[0].startswith("The time since the start is 0.64")
     assert np.all(outside == 0.0)
 
 
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
-    seen = replace(stated().seen, temperature=Interval(290.0, 300.0))
-    told = replace(stated(), seen=seen)
-    assert "seen_temperature_low" not in with_validity(replace(model, evidence=told)).values
-    warm = replace(model.with_effect(psa.EFFECTS["temperature"]), evidence=told)
+    observed = replace(stated().seen, temperature=Interval(290.0, 300.0))
+    output = replace(stated(), seen=observed)
+    assert "seen_temperature_low" not in with_validity(replace(model, evidence=output)).values
+    warm = replace(model.with_effect(psa.EFFECTS["temperature"]), evidence=output)
     watched = with_validity(warm)
     column = watched.output_names.index(OUTPUT)
     x = [q.start for q in watched.structure.states]
@@ -229,12 +229,12 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     record = psa.Record(name="fast", time=time, voltage=voltage, displacement=clean + noise)
     shorter, _ = prepared(record)
     assert shorter.n < record.n
-    found = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
-    told = evidence_of(
-        found, determinacy(found, (whole(shorter),)), (whole(shorter),),
-        found.predicted((whole(shorter),)), by="test", sampled=[record],
+    result = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
+    output = evidence_of(
+        result, determinacy(result, (whole(shorter),)), (whole(shorter),),
+        result.predicted((whole(shorter),)), by="test", sampled=[record],
     )  # fmt: skip
-    model = replace(found.model.plant(), evidence=replace(told, reference=None))
+    model = replace(result.model.plant(), evidence=replace(output, reference=None))
     with Archive(evident_fmu()) as archive:
         again = repeated(archive, model, [record])
         gone = repeated(archive, model, [record.slice(0, 7000)])
@@ -297,8 +297,8 @@ def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
 
 
 def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
-    told = replace(stated(), outside=("offset_drift",))
-    plant = replace(evident_model().plant(), evidence=told)
+    output = replace(stated(), outside=("offset_drift",))
+    plant = replace(evident_model().plant(), evidence=output)
     with Archive(evident_fmu()) as archive:
         row = repeated(archive, plant, [noisy_record()])[-1]
     assert isinstance(row, CheckRow)

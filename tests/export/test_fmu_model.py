@@ -33,9 +33,9 @@ def pendulum(*, indicators: int = 0, once: str = "false") -> Path:
     folder.mkdir()
     path = folder / "pendulum.fmu"
     with zipfile.ZipFile(path, "w") as archive:
-        said = (_SOURCES / "modelDescription.xml").read_text("utf-8")
-        said = said.format(indicators=indicators, once=once)
-        archive.writestr("modelDescription.xml", said)
+        text = (_SOURCES / "modelDescription.xml").read_text("utf-8")
+        text = text.format(indicators=indicators, once=once)
+        archive.writestr("modelDescription.xml", text)
         place = f"binaries/{fmpy.platform}/pendulum{fmpy.sharedLibraryExtension}"
         archive.write(_binary(), place)
     return path
@@ -82,8 +82,8 @@ def _record(most: float = np.inf) -> dict[str, FloatArray]:
     torque = sum(np.sin(2 * np.pi * f * T + rng.uniform(0, 6)) for f in (0.4, 0.9, 1.7, 2.6))
 
     def plant(t: float, q: FloatArray) -> list[float]:
-        given = float(np.clip(np.interp(t, T, torque), -most, most))
-        return [q[1], _rate(q[0], q[1], given, *TRUE.values())]
+        inputs = float(np.clip(np.interp(t, T, torque), -most, most))
+        return [q[1], _rate(q[0], q[1], inputs, *TRUE.values())]
 
     phi = solve_ivp(plant, (0, T[-1]), [0.1, 0], t_eval=T, rtol=1e-8, max_step=0.01).y[0]
     reach = TRUE["length"] * np.sin(phi) + 1e-3 * rng.standard_normal(len(T))
@@ -98,13 +98,15 @@ def test_rates_outputs_and_their_derivatives_are_those_of_the_fmu() -> None:
     assert y == pytest.approx([0.5 * np.sin(0.3), -0.7], rel=1e-14)
     by = ca.vertcat(s.x, s.u, s.p)
     slopes = ca.Function("slopes", s.arguments, [s.jacobian(s.xdot, by), s.jacobian(s.y, by)])
-    rates, shown = (np.array(v) for v in slopes(0.0, AT, 1.3, model.parameter_vector()))
+    rates, displayed = (np.array(v) for v in slopes(0.0, AT, 1.3, model.parameter_vector()))
     exact = [-9.81 * np.cos(0.3) / 0.5, -0.05 / 0.25, 4.0, np.nan, 0.7 / 0.25]
     held = 1.3 + 0.05 * 0.7
     exact[3] = -2.0 * held / 0.5**3 + 9.81 * np.sin(0.3) / 0.5**2
     assert rates[1] == pytest.approx(exact, rel=1e-7)
     assert rates[0] == pytest.approx([0, 1, 0, 0, 0])
-    assert shown[0] == pytest.approx([0.5 * np.cos(0.3), 0, 0, np.sin(0.3), 0], rel=1e-7, abs=1e-9)
+    assert displayed[0] == pytest.approx(
+        [0.5 * np.cos(0.3), 0, 0, np.sin(0.3), 0], rel=1e-7, abs=1e-9
+    )
 
 
 def test_the_variables_are_those_of_the_description() -> None:
@@ -125,11 +127,11 @@ def test_the_variables_are_those_of_the_description() -> None:
 
 
 def test_changed_parameters_are_identified() -> None:
-    found = psa.identify(psa.fmu_model(pendulum(), free=FREE), _record(), starts=2)
+    result = psa.identify(psa.fmu_model(pendulum(), free=FREE), _record(), starts=2)
     for name, value in TRUE.items():
-        assert abs(found.model.values[name] - value) < 4.0 * found.errors[name]
-        assert found.errors[name] < 0.01 * value
-    assert found.rms["reach"] == pytest.approx(1e-3, rel=0.05)
+        assert abs(result.model.values[name] - value) < 4.0 * result.errors[name]
+        assert result.errors[name] < 0.01 * value
+    assert result.rms["reach"] == pytest.approx(1e-3, rel=0.05)
 
 
 @pytest.mark.slow
@@ -144,10 +146,10 @@ def test_a_torque_that_goes_no_further_is_named() -> None:
 def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
     x, u, k = (ca.SX.sym(n) for n in ("x", "voltage", "k"))
     k_ = psa.Parameter("k", 3.0, "1/s", (0.1, 30.0), "rate", log=True)
-    own = psa.ode_model(
+    item = psa.ode_model(
         {"x": x, "u": u, "p": k, "ode": k * (u - x**3), "y": x + u}, name="cubic", parameters=[k_]
     )
-    path = psa.export_fmu(own, tmp_path / "cubic.fmu", fmi=3)
+    path = psa.export_fmu(item, tmp_path / "cubic.fmu", fmi=3)
     there = psa.fmu_model(path, free=["k"])
     u_: FloatArray = np.sin(np.arange(300) * 0.1)[:, None]
 
@@ -155,9 +157,9 @@ def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
         steps = psa.run(model, 4 * T[:300], u_, np.zeros(1), unknowns=["k"], outputs=["y"])
         return np.hstack([steps.y, steps.sensitivity[:, 0]])
 
-    assert run(there) == pytest.approx(run(own), rel=1e-6, abs=1e-7)
+    assert run(there) == pytest.approx(run(item), rel=1e-6, abs=1e-7)
     simulated = psa.simulate(there, 4 * T[:300], u_[:, 0], rtol=1e-7)
-    assert simulated.outputs["y"] == pytest.approx(run(own)[:, 0], rel=1e-6, abs=1e-6)
+    assert simulated.outputs["y"] == pytest.approx(run(item)[:, 0], rel=1e-6, abs=1e-6)
     with pytest.raises(psa.InputError, match="can only begin at its start values"):
         start_state(there, [0.0])
     values = [{"k": v} for v in np.linspace(1.0, 9.0, 40)]
@@ -200,15 +202,15 @@ def test_model_json_names_the_fmu_by_its_hash(tmp_path: Path) -> None:
         "file": "swing.fmu", "sha256": hashlib.sha256(fmu.read_bytes()).hexdigest(),
         "parameters": ["length", "damping"], "values": {"gravity": 1.62},
     }  # fmt: skip
-    found = psa.load_model(file)
-    assert dict(found.values) == dict(model.values)
-    assert found.structure.parameters == model.structure.parameters
-    assert found.own_starts() == model.own_starts() == {"body_phi": 0.1}
-    assert ports_of(found) == ports_of(model)
+    result = psa.load_model(file)
+    assert dict(result.values) == dict(model.values)
+    assert result.structure.parameters == model.structure.parameters
+    assert result.own_starts() == model.own_starts() == {"body_phi": 0.1}
+    assert ports_of(result) == ports_of(model)
     at = (0.2, AT, 1.3, model.parameter_vector())
-    for mine, its in zip(model.structure.f(*at), found.structure.f(*at), strict=True):
+    for mine, its in zip(model.structure.f(*at), result.structure.f(*at), strict=True):
         np.testing.assert_array_equal(np.array(its), np.array(mine))
-    psa.save_model(found, tmp_path / "again.json")
+    psa.save_model(result, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
 
 

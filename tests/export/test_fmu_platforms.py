@@ -183,13 +183,15 @@ def test_no_absolute_path_inside(fmi: int) -> None:
         rb"/(?:tmp|home|root|usr|opt|var|private|Users|mnt|work|build|nix)/",
         rb"[A-Za-z]:\\[A-Za-z]",
     )
-    own = [str(p).encode() for p in (Path.home(), Path.cwd(), Path(sys.prefix)) if len(str(p)) > 1]
+    items = [
+        str(p).encode() for p in (Path.home(), Path.cwd(), Path(sys.prefix)) if len(str(p)) > 1
+    ]
     entries = files_inside(everywhere(fmi).with_suffix(".fmu"))
     assert len(entries) > 30
     for name, content in entries.items():
-        found = {m for root in roots for m in re.findall(root + rb"[ -~]*", content)}
-        assert found <= (system if name.endswith(".dylib") else set()), (name, found)
-        assert not [path for path in own if path + b"/" in content], name
+        result = {m for root in roots for m in re.findall(root + rb"[ -~]*", content)}
+        assert result <= (system if name.endswith(".dylib") else set()), (name, result)
+        assert not [path for path in items if path + b"/" in content], name
 
 
 @cache

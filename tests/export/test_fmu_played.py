@@ -65,20 +65,20 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
         "k": 1.7, "lag_of_u_time": 0.3, "bend_of_u_size": 0.2, "lag_of_y_time": 0.4,
         "gain_of_y_size": 0.1, "delay_of_y_time": 0.2,
     }  # fmt: skip
-    own = _own()
+    item = _own()
     whole = psa.fmu_model(
-        psa.export_fmu(own, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
+        psa.export_fmu(item, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
     )
     table = {e.name: e for e in effects_of(whole, ALL)}
-    found = []
-    for base in (own, whole):
+    items = []
+    for base in (item, whole):
         model = extended(base, [table[n] for n in names]).with_values(values)
         free = ["k", *(n for n in values if n != "k")]
         start = begun(model, T, U, {})
         s0 = start.by_parameter[:, [model.parameter_names.index(n) for n in free]]
         steps = psa.run(model, T, U, start.x, rtol=1e-8, unknowns=free, s0=s0, outputs=["y"])
-        found.append((steps.y[:, 0], steps.sensitivity[:, 0]))
-    (y, slopes), (y_whole, slopes_whole) = found
+        items.append((steps.y[:, 0], steps.sensitivity[:, 0]))
+    (y, slopes), (y_whole, slopes_whole) = items
     assert np.max(np.abs(y_whole - y)) < 1e-3 * np.ptp(y)
     for n, one, other in zip(free, slopes.T, slopes_whole.T, strict=True):
         assert np.max(np.abs(one - other)) < 0.01 * np.max(np.abs(one)), n
@@ -94,7 +94,7 @@ def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
         validate=False,
     )["level"]  # fmt: skip
     truth = level(0.5, 0.01)
-    errors = [np.max(np.abs(shown - truth)) for shown in (y, peer)]
+    errors = [np.max(np.abs(displayed - truth)) for displayed in (y, peer)]
     assert errors[0] < 1e-4 * np.ptp(truth)
     assert errors[1] > 30 * errors[0]  # it holds the input at its value before the step
 
@@ -113,10 +113,10 @@ def test_a_step_is_divided_where_the_fmu_is_fast(tmp_path: Path) -> None:
             new.writestr(entry, re.sub(rb' stepSize="[^"]*"', b"", old.read(entry)))
     exact = psa.run(fast, T[::4], U[::4], np.zeros(1), rtol=1e-9).y
     there = psa.fmu_model(path, free=["k"], interface="co-simulation")
-    shown = psa.run(there, T[::4], U[::4], np.zeros(0)).y
-    assert np.std(shown - exact) < 1e-3 * np.std(exact)
-    given = {"k": 40.0}
-    run = Run(str(path), "", 1, ("u",), ("y",), given, T[::4], U[::4], "linear")
+    displayed = psa.run(there, T[::4], U[::4], np.zeros(0)).y
+    assert np.std(displayed - exact) < 1e-3 * np.std(exact)
+    table = {"k": 40.0}
+    run = Run(str(path), "", 1, ("u",), ("y",), table, T[::4], U[::4], "linear")
     with Fmu(path) as fmu:
         assert np.std(stepped(fmu, run) - exact) > 3e-3 * np.std(exact)
 
@@ -127,9 +127,9 @@ def test_a_supplier_s_parameters_are_identified_in_few_runs() -> None:
     model = psa.fmu_model(
         supplied("tank"), free={**AREA, "outlet": (1e-3, 0.1)}, values={"valve": 1.0}
     )
-    found = psa.identify(model, _record(0.7, 0.012))
+    result = psa.identify(model, _record(0.7, 0.012))
     for name, true in (("area", 0.7), ("outlet", 0.012)):
-        assert abs(found.model.values[name] - true) < 4 * found.errors[name]
+        assert abs(result.model.values[name] - true) < 4 * result.errors[name]
     assert RUNS.count - before < 80
 
 
@@ -137,18 +137,18 @@ def test_a_ball_is_followed_from_its_first_bounce_on() -> None:
     times = np.linspace(0.0, 3.0, 301)
     h = bounces(9.0, 0.8, times) + 2e-3 * np.random.default_rng(1).standard_normal(301)
     model = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0), "e": (0.4, 0.95)})
-    found = psa.identify(model, {"time": times, "h": h})
-    assert found.rms["h"] == pytest.approx(2e-3, rel=0.15)
+    result = psa.identify(model, {"time": times, "h": h})
+    assert result.rms["h"] == pytest.approx(2e-3, rel=0.15)
     for name, true in (("g", 9.0), ("e", 0.8)):
-        assert abs(found.model.values[name] - true) < 4 * found.errors[name]
+        assert abs(result.model.values[name] - true) < 4 * result.errors[name]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hidden", ["lag", "gain", "nothing"])
 def test_what_hides_around_a_supplier_s_fmu_is_named(hidden: str) -> None:
     flow = INFLOW * (0.88 if hidden == "gain" else 1.0)
-    shown = level(0.5, 0.012, flow)
-    record = _record(0.5, 0.012, lagged(shown, 3.0) if hidden == "lag" else shown)
+    values = level(0.5, 0.012, flow)
+    record = _record(0.5, 0.012, lagged(values, 3.0) if hidden == "lag" else values)
     model = psa.fmu_model(supplied("tank"), free={"outlet": (1e-3, 0.1)}, values={"valve": 1.0})
     d = psa.diagnose(model, record)
     expected = {"lag": ["lag_of_level"], "gain": ["gain_of_inflow"], "nothing": []}[hidden]
@@ -161,17 +161,17 @@ def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> Non
     k = ca.SX.sym("k")
     ode = {"x": x, "u": u, "p": k, "ode": ca.if_else(u > 0.3, k, -0.2 * k), "zero": u - 0.3, "y": x}
     k_ = psa.Parameter("k", 1.0, "1/s", (0.1, 9.0), "rate")
-    own = psa.ode_model(ode, name="switched", parameters=[k_], outputs=["y"])
-    path = psa.export_fmu(own, tmp_path / "switched.fmu", fmi=3)
+    model = psa.ode_model(ode, name="switched", parameters=[k_], outputs=["y"])
+    path = psa.export_fmu(model, tmp_path / "switched.fmu", fmi=3)
     # a step of co-simulation has one value of the input, and so begins or ends at the event
     ways: list[tuple[FmuInterface, float]] = [("model exchange", 1e-4), ("co-simulation", 0.02)]
     for interface, most in ways:
         there = psa.fmu_model(path, free=["k"], interface=interface)
         assert not there.state_names
-        found = psa.run(there, T, U, np.zeros(0), unknowns=["k"], outputs=["y"])
-        exact = psa.run(own, T, U, np.zeros(1), rtol=1e-9, unknowns=["k"], outputs=["y"])
-        assert found.y == pytest.approx(exact.y, abs=most)
-        assert found.sensitivity == pytest.approx(exact.sensitivity, abs=most)
+        result = psa.run(there, T, U, np.zeros(0), unknowns=["k"], outputs=["y"])
+        exact = psa.run(model, T, U, np.zeros(1), rtol=1e-9, unknowns=["k"], outputs=["y"])
+        assert result.y == pytest.approx(exact.y, abs=most)
+        assert result.sensitivity == pytest.approx(exact.sensitivity, abs=most)
 
 
 def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:
@@ -229,11 +229,11 @@ def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
     of = ["--fmu", supplied("tank"), "--value", "valve=1"]
     out = tmp_path / "out.csv"
     typed("simulate", *of, "--value", "area=0.7", "--input", record, "-o", out)
-    shown = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
-    assert shown == pytest.approx(level(0.7, 0.01), abs=1e-3)
+    displayed = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
+    assert displayed == pytest.approx(level(0.7, 0.01), abs=1e-3)
     for name in ("fit.fmu", "fit.ssv", "fit.json"):
-        said = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
-        assert ("an importer must set the start values" in said) == (name == "fit.fmu")
+        statement = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
+        assert ("an importer must set the start values" in statement) == (name == "fit.fmu")
     with zipfile.ZipFile(tmp_path / "fit.fmu") as archive:
         root = ET.fromstring(archive.read("modelDescription.xml"))
     starts = {v.get("name"): v[0].get("start") for v in root.iterfind("ModelVariables/*")}
@@ -251,35 +251,37 @@ def with_effects() -> psa.Model:
     model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
     sizes = Sizes({"inflow": 0.05, "level": 0.6}, {}, 0.2, 100.0)
     table = {e.name: e for e in effects_of(model, sizes)}
-    found = extended(model, [table["gain_of_inflow"], table["lag_of_level"]])
+    result = extended(model, [table["gain_of_inflow"], table["lag_of_level"]])
     values = {"area": 0.7, "gain_of_inflow_size": -0.12, "lag_of_level_time": 3.0}
-    return found.with_values(values)
+    return result.with_values(values)
 
 
 def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
-    found = with_effects()
-    path = psa.export_extended(found, tmp_path / "tank.ssp", step=0.05)
+    model = with_effects()
+    path = psa.export_extended(model, tmp_path / "tank.ssp", step=0.05)
     fine = np.linspace(0.0, 100.0, 2001)
     flow = np.interp(fine, TIMES, INFLOW)[:, None]
     with SspArchive(path) as archive:
         assert archive.parameters["original"] == {"area": 0.7, "valve": 1.0}
-        shown = couple(
+        displayed = couple(
             archive, fine, Signals(("inflow",), fine, flow), ["level"], rates=False
         )[:, 0]  # fmt: skip
     truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
-    assert np.interp(TIMES, fine, shown) == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
+    assert np.interp(TIMES, fine, displayed) == pytest.approx(
+        truth, abs=0.01 * float(np.ptp(truth))
+    )
     with zipfile.ZipFile(path) as inside:
         assert inside.read("resources/original.fmu") == supplied("tank").read_bytes()
         root = ET.fromstring(inside.read("resources/original.ssv"))
     kinds = {p.get("name"): p[0].tag.rpartition("}")[2] for p in root.iterfind(".//{*}Parameter")}
     assert kinds == {"area": "Real", "valve": "Boolean"}
-    one = psa.export_extended(found, tmp_path / "tank.fmu")
-    given = np.array([*zip(fine, flow[:, 0], strict=True)], [("time", float), ("inflow", float)])
+    one = psa.export_extended(model, tmp_path / "tank.fmu")
+    inputs = np.array([*zip(fine, flow[:, 0], strict=True)], [("time", float), ("inflow", float)])
     played = fmpy.simulate_fmu(
-        str(one), stop_time=100.0, output_interval=0.05, input=given, output=["level"]
+        str(one), stop_time=100.0, output_interval=0.05, input=inputs, output=["level"]
     )
-    shown = np.interp(TIMES, played["time"], played["level"])
-    assert shown == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
+    displayed = np.interp(TIMES, played["time"], played["level"])
+    assert displayed == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
     ball = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0)})
     with pytest.raises(psa.InputError, match=r"is of FMI 3\.0, which no FMU holds here"):
         psa.export_extended(ball, tmp_path / "ball.fmu")

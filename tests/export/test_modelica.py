@@ -43,12 +43,12 @@ def _without_version(text: str) -> list[str]:
 
 def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
     path = tmp_path / "PiezoStack.mo"
-    said = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
-    assert "left out: sensor" in said
-    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in said
+    statement = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
+    assert "left out: sensor" in statement
+    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in statement
     expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
-    found = _without_version(path.read_text(encoding="utf-8"))
-    diff = "".join(difflib.unified_diff(expected, found, "accepted", "found", n=1))
+    texts = _without_version(path.read_text(encoding="utf-8"))
+    diff = "".join(difflib.unified_diff(expected, texts, "accepted", "found", n=1))
     assert not diff, f"{diff}\nIf this is meant: {_ACCEPT}"
 
 
@@ -130,8 +130,8 @@ _WIRED = "PiezoStack.Examples.Wired"
 def _value(text: str, part: str, name: str) -> float:
     """Return what the example gives a parameter of one of its parts."""
     example = text.split("model Wired")[1]
-    found = example.split(f" {part}(")[1].split(f"{name}=")[1]
-    return float(found.split(",")[0].split(")")[0])
+    result = example.split(f" {part}(")[1].split(f"{name}=")[1]
+    return float(result.split(",")[0].split(")")[0])
 
 
 def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
@@ -169,9 +169,9 @@ def _by_hand(p: dict[str, float], text: str, t: FloatArray) -> FloatArray:
 
     size = np.array([100.0, 100.0, 1e3, 1e-5, 1e-2, 1e-5, 1e-2, 1e-5, 1e-2])
     span = (0.0, float(t[-1]))
-    found = solve_ivp(rates, span, np.zeros(9), "Radau", t, rtol=1e-10, atol=1e-12 * size)
-    drawn = np.array([current(time, u) for time, u in zip(t, found.y[0], strict=True)])
-    return np.array([found.y[5], found.y[7], drawn])
+    result = solve_ivp(rates, span, np.zeros(9), "Radau", t, rtol=1e-10, atol=1e-12 * size)
+    drawn = np.array([current(time, u) for time, u in zip(t, result.y[0], strict=True)])
+    return np.array([result.y[5], result.y[7], drawn])
 
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], ["P-885.51", "WYDS0808020"]))
@@ -263,8 +263,8 @@ def test_a_flipped_sign_is_caught(old: str, new: str, count: int) -> None:
     text = text_of("P-885.51")
     start = text.index("  equation\n")
     pattern = rf"(?<=\s){re.escape(old)}(?=\s(?!1e-24))"
-    found = list(re.finditer(pattern, re.sub(r"//[^\n]*", lambda m: " " * len(m[0]), text[start:])))
-    place = start + found[count].start()
+    items = list(re.finditer(pattern, re.sub(r"//[^\n]*", lambda m: " " * len(m[0]), text[start:])))
+    place = start + items[count].start()
     assert right_side_error(model_named("P-885.51"), text[:place] + new + text[place + 1 :]) > 1e-6
 
 

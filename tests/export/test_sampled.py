@@ -236,8 +236,8 @@ def test_co_simulation(fmi: int, step: float, start: float) -> None:
     slope = SLOPE if fmi == 2 else 0.0  # FMI 3.0 has no rates of inputs
     times = grid(round(30 / step), step, start)
     with Fmu(exported("loop", fmi)) as fmu:
-        found = co_simulate(fmu, times, reference(slope), OUTPUTS, tolerance=1e-10)
-    assert error(found, times, slope) < 1e-9
+        values = co_simulate(fmu, times, reference(slope), OUTPUTS, tolerance=1e-10)
+    assert error(values, times, slope) < 1e-9
 
 
 @VERSIONS
@@ -246,8 +246,8 @@ def test_co_simulation(fmi: int, step: float, start: float) -> None:
 def test_model_exchange(fmi: int, step: float, start: float) -> None:
     times = grid(round(30 / step), step, start)
     with Fmu(exported("loop", fmi)) as fmu:
-        found = integrate(fmu, times, reference(SLOPE), OUTPUTS, tolerance=1e-11)
-    assert error(found, times, SLOPE) < 1e-9
+        result = integrate(fmu, times, reference(SLOPE), OUTPUTS, tolerance=1e-11)
+    assert error(result, times, SLOPE) < 1e-9
 
 
 @VERSIONS
@@ -298,11 +298,11 @@ def simulated(model: Model, inputs: str, names: tuple[str, ...]) -> Mapping[str,
 
 def test_rumoca_follows_the_exact_recursion() -> None:
     names = ("position", "voltage", "integral", "command")
-    found = simulated(loop(), "disturbance=0, reference=1.0 + 30.0*time", names)
+    result = simulated(loop(), "disturbance=0, reference=1.0 + 30.0*time", names)
     truth = expected(grid(COUNT, 0.25), 1.0, 30.0)
     columns = (truth.position, truth.voltage, truth.z[:, 0], truth.z[:, 1])
     for name, column in zip(names, columns, strict=True):
-        assert np.abs(found[name] - column).max() < 1e-8, name
+        assert np.abs(result[name] - column).max() < 1e-8, name
 
 
 def _shared() -> Model:
@@ -353,10 +353,10 @@ def test_shared_parts_and_balances_have_their_values_before_the_instant() -> Non
     assert re.search(r"shared_part = .*pre\(first\)", clause)
     assert "discrete Real shared_part(start=0.0, fixed=true)" in text
     assert "displacement" not in clause
-    found = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "shown"))
+    result = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "shown"))
     times = grid(COUNT, 0.25)
     steps = run(model, times, (1.0 - 30.0 * times)[:, None], np.zeros(1), rtol=1e-12)
     for name, column in (("first", steps.z[:, 0]), ("second", steps.z[:, 1])):
-        assert np.abs(found[name] - column).max() < 1e-8, name
-    assert np.abs(found["shown"] - steps.y[:, 0]).max() < 1e-8
+        assert np.abs(result[name] - column).max() < 1e-8, name
+    assert np.abs(result["shown"] - steps.y[:, 0]).max() < 1e-8
     assert np.ptp(steps.z[:, 0]) > 0.1

@@ -136,9 +136,9 @@ def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
     with zipfile.ZipFile(archive_of("closed_loop")) as archive:
         assert archive.read("documentation/wiring.svg") == svg
     root = etree.fromstring(svg)
-    shown = [e.text for e in root.iter("{*}text")]
-    assert set(wiring.parts) <= set(shown)
-    assert {p.name for p in layout.places if p.part} <= set(shown)
+    items = [e.text for e in root.iter("{*}text")]
+    assert set(wiring.parts) <= set(items)
+    assert {p.name for p in layout.places if p.part} <= set(items)
     png = save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
     assert png.startswith(b"\x89PNG")
     with pytest.raises(InputError, match=r"\.svg or \.png"):
@@ -164,18 +164,18 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     """
     text = texts(archive_of(name))["SystemStructure.ssd"]
     assert "SystemGeometry" not in text
-    found = re.search(
+    result = re.search(
         r'<ssd:Annotations>\s*<ssc:Annotation type="org.openmodelica">\s*<oms:Annotations>\s*'
         r'<oms:SimulationInformation>\s*<oms:FixedStepMaster description="oms-ma"'
         r' stepSize="(0\.\d+)" relativeTolerance="(0\.\d+)" />',
         text,
     )
-    assert found is not None
+    assert result is not None
     root = etree.fromstring(text.encode())
     assert root.nsmap["oms"].endswith("/OMSimulator/master/schema/oms.xsd")
     assert [c.tag.partition("}")[2] for c in root[0]][-2:] == ["Connections", "Annotations"]
     wiring = wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
-    step = float(found[1])
+    step = float(result[1])
     assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
     assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
     assert f"{step:.0e}"[0] in "125"
@@ -197,11 +197,11 @@ def test_two_parts_approach_an_independent_solution(rates: bool, order: int) -> 
     errors = []
     with SspArchive(archive_of("pushed_stage")) as archive:
         for step in (1e-6, 5e-7):
-            found = couple(
+            values = couple(
                 archive, points(step, END), ramp(), ["stack.x", "stage_position"], rates=rates,
                 tolerance=1e-9,
             )  # fmt: skip
-            errors.append(float(np.abs(found[-1] - exact).max()) / exact[0])
+            errors.append(float(np.abs(values[-1] - exact).max()) / exact[0])
     assert errors[0] / errors[1] > 0.8 * 2**order
     assert errors[1] < (5e-3 if order == 1 else 2e-6)
 

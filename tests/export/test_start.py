@@ -96,18 +96,18 @@ def test_start_derivatives_are_differences_of_starts() -> None:
             start_state(model.with_values({name: model.values[name] + h}), inputs, rates, memory).x
             for h in (step, -step)
         ]
-        found = (ends[0] - ends[1]) / (2 * step) * model.parameter(name).typical(model.values)
+        result = (ends[0] - ends[1]) / (2 * step) * model.parameter(name).typical(model.values)
         exact = start.by_parameter[:, k] * model.parameter(name).typical(model.values)
-        assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
+        assert np.all(np.abs(result - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
     names = ("f_H", "z_c1", "z_c2", "z_c3")
     assert start.by_start.shape == (len(start.x), len(names))
     for k, name in enumerate(names):
         size = model.state_nominals()[model.state_names.index(name)]
         moved = [{**memory, name: memory.get(name, 0.0) + h * size} for h in (1e-5, -1e-5)]
         ends = [start_state(model, inputs, rates, m).x for m in moved]
-        found = (ends[0] - ends[1]) / 2e-5
+        result = (ends[0] - ends[1]) / 2e-5
         exact = start.by_start[:, k] * size
-        assert np.all(np.abs(found - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
+        assert np.all(np.abs(result - exact) <= 1e-7 * (np.abs(exact) + model.state_nominals()))
 
 
 def test_sensitivity_to_a_start_is_the_difference_of_runs() -> None:
@@ -120,9 +120,9 @@ def test_sensitivity_to_a_start_is_the_difference_of_runs() -> None:
     for column, k in enumerate(unknowns):
         step: FloatArray = 1e-3 * np.eye(len(start))[k] * model.state_nominals()
         ends = [psa.run(model, t, u, start + sign * step, rtol=1e-8).y[:, -1] for sign in (1, -1)]
-        found = (ends[0] - ends[1]) / (2 * step[k])
+        result = (ends[0] - ends[1]) / (2 * step[k])
         size = np.abs(exact[:, column]).max()
-        np.testing.assert_allclose(found, exact[:, column], rtol=0, atol=1e-4 * size)
+        np.testing.assert_allclose(result, exact[:, column], rtol=0, atol=1e-4 * size)
 
 
 def test_initial_slope_sees_motion_and_no_step() -> None:
@@ -150,8 +150,8 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
     ).displacement[2400:]
     memory = psa.memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
     # the record begins in motion: the fast states start there, as `start_state` has it
-    found = psa.simulate(model, t, voltage, memory=memory).displacement
-    assert np.abs(found - whole)[50:].max() < 1e-4 * np.ptp(whole)
+    result = psa.simulate(model, t, voltage, memory=memory).displacement
+    assert np.abs(result - whole)[50:].max() < 1e-4 * np.ptp(whole)
 
 
 def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
@@ -179,8 +179,8 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
-    for history, said in (("120", "--start-voltage"), ("high", "--history is 'high'")):
-        assert said in refused(*command, "--history", history)
+    for history, statement in (("120", "--start-voltage"), ("high", "--history is 'high'")):
+        assert statement in refused(*command, "--history", history)
 
 
 @pytest.mark.parametrize(
@@ -208,20 +208,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     psa.write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
     psa.save_model(STACK, made / "plain.json")
     psa.save_model(psa.settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
-    said = done(
+    statement = done(
         "export", "fmu", "--model", made / "plain.json", "-o", made / "m.fmu", *OPTIONS
     ).words
-    assert "start: the start values of the model at 60 V" in said
+    assert "start: the start values of the model at 60 V" in statement
     return made
 
 
 def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
     out = folder / "out.csv"
     files = ("--model", folder / model, "--input", folder / "v.csv", "-o", out)
-    said = done("simulate", *files, *options).out
-    found = psa.read_record(out).displacement
-    assert found is not None
-    return found, next(line for line in said.splitlines() if line.startswith("start: "))
+    statement = done("simulate", *files, *options).out
+    result = psa.read_record(out).displacement
+    assert result is not None
+    return result, next(line for line in statement.splitlines() if line.startswith("start: "))
 
 
 def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
@@ -233,19 +233,19 @@ def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
         truth = co_simulate(fmu, TIME, inputs, ["displacement"], tolerance=1e-9)[:, 0]
     span = float(np.ptp(truth))
     for model, options in (("plain.json", OPTIONS), ("held.json", [])):
-        found, said = _simulated(folder, model, *options)
-        assert np.abs(found - truth).max() < 3e-6 * span, model
-        assert "at 60 V, as an exported FMU has them" in said
-        assert "step" not in said
-    relaxed, said = _simulated(folder, "plain.json")
+        result, statement = _simulated(folder, model, *options)
+        assert np.abs(result - truth).max() < 3e-6 * span, model
+        assert "at 60 V, as an exported FMU has them" in statement
+        assert "step" not in statement
+    relaxed, statement = _simulated(folder, "plain.json")
     assert np.abs(relaxed - truth).max() > 0.02 * span
-    assert "settled at 60 V" in said
-    assert "--start-voltage 60" in said
-    _, said = _simulated(folder, "held.json", "--start-voltage", "0")
-    assert "at 0 V" in said
-    assert "step from there to 60 V" in said
-    _, said = _simulated(folder, "held.json", "--history", "120,0")
-    assert "where the history 120,0 V leaves them" in said
+    assert "settled at 60 V" in statement
+    assert "--start-voltage 60" in statement
+    _, statement = _simulated(folder, "held.json", "--start-voltage", "0")
+    assert "at 0 V" in statement
+    assert "step from there to 60 V" in statement
+    _, statement = _simulated(folder, "held.json", "--history", "120,0")
+    assert "where the history 120,0 V leaves them" in statement
 
 
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
@@ -261,9 +261,9 @@ def test_the_check_has_a_row_for_the_start(folder: Path) -> None:
     plain, settled = STACK.plant(), psa.settled_at(STACK, 60.0, [120.0, 0.0]).plant()
     with Fmu(folder / "m.fmu") as fmu:
         assert list(wrong_start(fmu, truth_of(settled, 2))) == []
-        found = list(wrong_start(fmu, truth_of(plain, 2)))
-        assert any("co-simulation 'voltage' starts at 60, the model at 0" in f for f in found)
-        assert any("model exchange 'voltage' starts at 60" in f for f in found)
+        items = list(wrong_start(fmu, truth_of(plain, 2)))
+        assert any("co-simulation 'voltage' starts at 60, the model at 0" in f for f in items)
+        assert any("model exchange 'voltage' starts at 60" in f for f in items)
     with Archive(folder / "m.fmu") as archive:
         assert any(
             f.startswith("'voltage' starts at 60") for f in wrong_start_values(archive, plain)
@@ -328,16 +328,16 @@ def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage:
                 ends.append(instance.get(names))
         change = (ends[0] - ends[1]) / 0.1
         with begun(fmu, voltage) as instance:
-            found = instance.directional(names, [START_VOLTAGE], [1.0])
+            values = instance.directional(names, [START_VOLTAGE], [1.0])
             moved = np.array([n in ("charge", "displacement", "blocked_force") for n in names])
-            assert np.allclose(found[moved], change[moved], rtol=1e-4, atol=0.0)
+            assert np.allclose(values[moved], change[moved], rtol=1e-4, atol=0.0)
             jump = instance.directional(names, ["voltage"], [1.0])  # of one that does not settle
             rests = [names.index(n) for n in ("der(u)", "der(f_H)", "current")]
-            assert np.all(np.abs(found[rests]) < 1e-9 * np.abs(jump[rests]))
+            assert np.all(np.abs(values[rests]) < 1e-9 * np.abs(jump[rests]))
             (twice,) = instance.directional(["displacement"], [START_VOLTAGE, "k_L"], [2.0, 0.0])
-            assert twice == pytest.approx(2.0 * found[names.index("displacement")], rel=1e-12)
+            assert twice == pytest.approx(2.0 * values[names.index("displacement")], rel=1e-12)
             if fmi == 3:
-                for name, slope in zip(np.array(names)[moved], found[moved], strict=True):
+                for name, slope in zip(np.array(names)[moved], values[moved], strict=True):
                     both = instance.adjoint([name], ["time", START_VOLTAGE], [1.0])
                     assert both[1] == pytest.approx(slope, rel=1e-9)
             instance.require("ExitInitializationMode")
@@ -348,15 +348,15 @@ def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage:
 def test_what_is_set_by_itself_stays_whatever_the_order(fmi: int) -> None:
     """States and the voltage; parameters and other inputs count as they are at the end."""
     softer = model_named(NAME).plant().with_values({"k_L": 6.3})
-    own = {"f_H": -40.0, "v_x": 2e-4, "voltage": 55.0}
-    values = {START_VOLTAGE: 60.0, **own, "k_L": 6.3, "load_force": -20.0}
+    table = {"f_H": -40.0, "v_x": 2e-4, "voltage": 55.0}
+    values = {START_VOLTAGE: 60.0, **table, "k_L": 6.3, "load_force": -20.0}
     at_rest = start_state(softer, [60.0, -20.0], memory={"f_H": -40.0}).x
-    expected = dict(zip(softer.state_names, at_rest.tolist(), strict=True)) | own
+    expected = dict(zip(softer.state_names, at_rest.tolist(), strict=True)) | table
     assert softer.input_names == ("voltage", "load_force")
     with Fmu(exported(NAME, fmi)) as fmu:
         for names in (list(values), list(values)[::-1]):
             with fmu.start(CO_SIMULATION, values={n: values[n] for n in names}) as slave:
-                assert apart(fmu, slave, own) == 0.0
+                assert apart(fmu, slave, table) == 0.0
                 assert apart(fmu, slave, expected) < 1e-8
     assert abs(expected["x"] / settled(softer, 60.0)["x"] - 1.0) > 1e-2
 

@@ -51,8 +51,8 @@ def started(model: psa.Model, t: FloatArray, v: FloatArray) -> FloatArray:
 
 def ordinary_size(model: psa.Model, effect: psa.Component) -> float:
     """Return the gain that a page switches an effect on with."""
-    (told,) = (e for e in live_data(model, b"")["effects"] if e["name"] == effect.name)
-    return float(told["on"])
+    (output,) = (e for e in live_data(model, b"")["effects"] if e["name"] == effect.name)
+    return float(output["on"])
 
 
 def everything() -> psa.Model:
@@ -69,16 +69,16 @@ def test_every_effect_runs_in_one_module_as_it_does_here(browser: Browser) -> No
     for effect in psa.EFFECTS.values():
         rows[effect.name] = model.with_values({effect.gain or "": ordinary_size(model, effect)})
     starts = {name: started(m, t, v) for name, m in rows.items()}
-    told = run_in_browser(
+    output = run_in_browser(
         browser, model, [case(m, t, v, start=starts[name].tolist()) for name, m in rows.items()]
     )
     changed = []
-    for (name, m), row in zip(rows.items(), told, strict=True):
+    for (name, m), row in zip(rows.items(), output, strict=True):
         here, way = accurate(m, t, inputs(m, v), starts[name], rtol=1e-6, hold="linear")
         wanted = here.y[:, m.output_names.index("measured_displacement")]
         assert row["way"] == way, name
         assert off(row["shown"], wanted) < SAME, name
-        changed.append(off(row["shown"], told[0]["shown"]))
+        changed.append(off(row["shown"], output[0]["shown"]))
     assert sum(c > 1e-5 for c in changed) >= 18  # the others need another voltage to show
 
 
@@ -92,6 +92,6 @@ def test_a_module_asks_for_nothing_but_mathematical_functions() -> None:
     module = web_module(psa.stack_model("P-885.51"))
     assert module[:4] == b"\0asm"
     assert len(module) < 90_000
-    asked = set(re.findall(rb"Math[\x01-\x08]([a-z0-9]+)\x00", module))
-    assert asked == {b"pow"}
+    requested = set(re.findall(rb"Math[\x01-\x08]([a-z0-9]+)\x00", module))
+    assert requested == {b"pow"}
     assert b"wasi" not in module

@@ -57,10 +57,10 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
     """
     compliance = 1 / p["k_P"] + 1 / p["k_B"]
     lag = p["tau"] + p["R_s"] * p["C_p"] + p["c_P"] / p["k_P"] + p["c_B"] / p["k_B"]
-    own = {name: p[name] for name in ("beta", "gamma", "delta", "n", "h_ref", "tau", "u_rated")}
+    table = {name: p[name] for name in ("beta", "gamma", "delta", "n", "h_ref", "tau", "u_rated")}
     stack = Stack(
         r_s=p["R_s"], c_p_el=p["C_p"], k_l=p["k_L"], a=p["A"], m_p=p["m_P"], c_p=p["c_P"],
-        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **own,
+        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **table,
     )  # fmt: skip
     return {
         "slope": (p["k_L"] + p["A"]) * compliance,
@@ -84,10 +84,10 @@ def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
     """
     model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
     y: FloatArray = np.asarray(record.displacement)
-    found = fit(model, [whole(record)], [], sigma=[rms])
+    result = fit(model, [whole(record)], [], sigma=[rms])
     again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])
-    assert found.rms == pytest.approx(again.rms, rel=1e-3)
-    assert rms < 1.001 * found.rms
-    x, _, _ = predict_record(model, record, found.start(0), [],
+    assert result.rms == pytest.approx(again.rms, rel=1e-3)
+    assert rms < 1.001 * result.rms
+    x, _, _ = predict_record(model, record, result.start(0), [],
                              stop=record.n, rtol=1e-8)  # fmt: skip
-    assert np.std(x - y) == pytest.approx(found.rms, rel=2e-3)
+    assert np.std(x - y) == pytest.approx(result.rms, rel=2e-3)

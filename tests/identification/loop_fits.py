@@ -36,5 +36,5 @@ def loops(name: str) -> tuple[Fit, tuple[Experiment, ...], Determinacy]:
     ]
     experiments = tuple(whole(r) for r in records)
     sigma = [NOISE * r.range_m for r in records]
-    found = fit(model, experiments, FREE, sigma=sigma)
-    return found, experiments, determinacy(found, experiments)
+    result = fit(model, experiments, FREE, sigma=sigma)
+    return result, experiments, determinacy(result, experiments)

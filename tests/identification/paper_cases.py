@@ -31,13 +31,13 @@ def poles(p: dict[str, float]) -> ComplexArray:
 
 def residues(p: dict[str, float]) -> ComplexArray:
     """Return r_i of the step response 1 + sum r_i e^(p_i t), by the limit (s - p_i) G(s)/s."""
-    found = []
+    items = []
     for k, pole in enumerate(poles(p)):
         others = np.delete(poles(p), k)
         scale = p["tau"] * p["m_P"] * p["m_B"] * compliance(p)
         both = (p["c_B"] + p["c_P"]) * pole + p["k_B"] + p["k_P"]
-        found.append(both / (scale * pole * np.prod(pole - others)))
-    return np.array(found)
+        items.append(both / (scale * pole * np.prod(pole - others)))
+    return np.array(items)
 
 
 def step_response(p: dict[str, float], time: FloatArray) -> FloatArray:
@@ -120,7 +120,7 @@ def transfer(theta: FloatArray, frequency: FloatArray) -> ComplexArray:
     """Return X/U at the frequencies [Hz], shape (k,), gain 1 at rest."""
     s = 2j * np.pi * frequency
     whole = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
-    found: ComplexArray = (1.0 + numerator_time(theta) * s) / np.prod(
+    spectrum: ComplexArray = (1.0 + numerator_time(theta) * s) / np.prod(
         1.0 - s[:, None] / whole, axis=1
     )
-    return found
+    return spectrum

@@ -32,16 +32,16 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
     ringing, last = results[-2:]
     assert ringing.sentence.startswith("If the mechanics ring, m_P and m_B would be determined")
     assert (last.kind, last.record) == ("force", None)
-    found, experiments, determined = loops("PTBS200")
-    given = advice(found, experiments, determined, force_scale_given=True)
-    assert [a.sentence for a in given] == [a.sentence for a in results[:-1]]
+    result, experiments, determined = loops("PTBS200")
+    advices = advice(result, experiments, determined, force_scale_given=True)
+    assert [a.sentence for a in advices] == [a.sentence for a in results[:-1]]
 
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], ["PTBS200", "P-885.51"]))
 def test_following_the_advice_determines_what_it_promises(name: str) -> None:
     """The truth beyond the loops is not known to the advice: PTBS200 rings, the other does not."""
     model = stack(name)
-    found, experiments, determined = loops(name)
+    result, experiments, determined = loops(name)
     results = advised(name)
     new = [
         whole(measured(model, f"new {k}", a.record.time, a.record.voltage, 10 + 20 * k + i))
@@ -54,7 +54,7 @@ def test_following_the_advice_determines_what_it_promises(name: str) -> None:
         promised += [n for a in results if a.sentence.startswith("If") for n in a.parameters]
     assert set(determined.undetermined) <= set(promised)
     both = [*experiments, *new]
-    sigma = [*found.sigma, *[found.sigma[0]] * len(new)]
+    sigma = [*result.sigma, *[result.sigma[0]] * len(new)]
     again = fit(model, both, tuple(dict.fromkeys([*FREE, *promised])), sigma=sigma)
     after = determinacy(again, both)
     assert not set(promised) & set(after.undetermined)
@@ -71,10 +71,10 @@ def test_what_no_record_can_tell_is_said() -> None:
     time, voltage = loop_voltage(model.values, 1.0, 1.0)
     record = measured(model, "loop", time, voltage, 3)
     experiments = [whole(record)]
-    found = fit(model, experiments, ("k_L", "R_s", "C_p"), sigma=[NOISE * record.range_m])
-    determined = determinacy(found, experiments)
+    result = fit(model, experiments, ("k_L", "R_s", "C_p"), sigma=[NOISE * record.range_m])
+    determined = determinacy(result, experiments)
     assert {"R_s", "C_p"} == set(determined.undetermined)
-    results = advice(found, experiments, determined)
+    results = advice(result, experiments, determined)
     nothing = [a for a in results if a.sentence.startswith("None of the ")]
     assert len(nothing) == 1
     assert set(determined.undetermined) <= set(nothing[0].parameters)
@@ -85,13 +85,13 @@ def test_plans_stay_within_the_records_voltages() -> None:
     model = stack("P-885.51")
     time, voltage = loop_voltage(model.values, 0.7, 1.0)
     record = Record(name="loop", time=time, voltage=voltage - 20.0)
-    found = plans([model], [record])
-    assert {p.kind for p in found} == {"step", "multisine", "loop", "minor loops"}
-    for p in found:
+    result = plans([model], [record])
+    assert {p.kind for p in result} == {"step", "multisine", "loop", "minor loops"}
+    for p in result:
         assert p.record.voltage.min() >= -20.0 - 1e-9
         assert p.record.voltage.max() <= 0.7 * 120.0 - 20.0 + 1e-9
         assert p.record.voltage[0] == pytest.approx(-20.0)
         assert "-20 V" in plan_words(p)
-    rates = [p.rate for p in found if p.kind == "step"]
+    rates = [p.rate for p in result if p.kind == "step"]
     assert rates == sorted(rates)
     assert len(rates) <= 6

@@ -18,15 +18,15 @@ UNITS_OF_FORCE = ("N/V", "N/(V.s)", "N", "kg", "N.s/m", "N/m")
 
 def of(result: tuple[Combination, ...], text: str) -> Combination:
     """Return the one combination whose sentence holds the text."""
-    (found,) = [c for c in result if text in c.sentence]
-    return found
+    (combination,) = [c for c in result if text in c.sentence]
+    return combination
 
 
 @pytest.mark.parametrize("name", ["micromanipulator", "demo"])
 def test_slow_loops_know_the_sum_of_the_lags(name: str) -> None:
-    found, _, determined = loops(name)
-    p, errors = found.model.values, determined.standard_errors
-    result = of(free_combinations(found.model, determined), "the sum of the lags")
+    matches, _, determined = loops(name)
+    p, errors = matches.model.values, determined.standard_errors
+    result = of(free_combinations(matches.model, determined), "the sum of the lags")
     assert result.relative_error < 0.05
     (formula,) = [f for f in physical_formulas(p, FREE) if f.text == result.known]
     error = result.relative_error * formula.value(p)
@@ -39,21 +39,21 @@ def test_slow_loops_know_the_sum_of_the_lags(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["micromanipulator", "P-885.51"])
 def test_every_undetermined_parameter_is_in_a_sentence(name: str) -> None:
-    found, _, determined = loops(name)
+    matches, _, determined = loops(name)
     assert determined.undetermined
-    result = free_combinations(found.model, determined)
+    result = free_combinations(matches.model, determined)
     named = {n for c in result[:-2] for n in c.parameters}
     assert set(determined.undetermined) <= named
     for c in result:
-        assert c.sentence[0].isupper() or c.sentence.split()[0] in found.model.values
+        assert c.sentence[0].isupper() or c.sentence.split()[0] in matches.model.values
         assert c.sentence.endswith(".")
         assert all(n in c.sentence for n in c.parameters)
 
 
 def test_what_follows_from_the_form_is_true() -> None:
     """Forces may all be scaled, and R_s against C_p, and no displacement changes."""
-    found, experiments, determined = loops("P-885.51")
-    model, record = found.model, experiments[1].record
+    result, experiments, determined = loops("P-885.51")
+    model, record = result.model, experiments[1].record
     scale = of(free_combinations(model, determined), "The scale of force is free")
     assert scale.parameters == tuple(
         p.name for p in model.structure.parameters if p.unit in UNITS_OF_FORCE
@@ -69,8 +69,8 @@ def test_what_follows_from_the_form_is_true() -> None:
 
 
 def test_a_given_stiffness_ends_the_freedom_of_scale() -> None:
-    found, _, determined = loops("P-885.51")
-    result = free_combinations(found.model, determined, force_scale_given=True)
+    matches, _, determined = loops("P-885.51")
+    result = free_combinations(matches.model, determined, force_scale_given=True)
     assert not any("scale of force" in c.sentence for c in result)
 
 
@@ -79,8 +79,8 @@ def made(model: Model, errors: dict[str, float], free: dict[str, float]) -> Dete
     names = tuple(errors)
     values = np.array([model.values[n] for n in names])
     along = np.array([free.get(n, 0.0) for n in names]) * values
-    own = np.array([errors[n] for n in names]) * values
-    covariance: FloatArray = np.outer(along, along) + np.diag(own**2)
+    item = np.array([errors[n] for n in names]) * values
+    covariance: FloatArray = np.outer(along, along) + np.diag(item**2)
     spread: FloatArray = np.sqrt(np.diag(covariance))
     return Determinacy(
         names=names,
@@ -133,10 +133,10 @@ def test_what_is_determined_or_free_by_itself_has_no_formula() -> None:
 @pytest.mark.parametrize("samples", [20, 90, 400])
 def test_slow_residuals_leave_no_negative_variance(samples: int) -> None:
     """Of residuals that swing slowly the correlation, cut off at its last lag, is none."""
-    found, experiments, _ = loops("P-885.51")
-    count = len(found.residuals)
-    slow = found.sigma[0] * np.sin(2.0 * np.pi * np.arange(count) / samples)
-    covariance = covariance_of(replace(found, residuals=slow), experiments)
+    result, experiments, _ = loops("P-885.51")
+    count = len(result.residuals)
+    slow = result.sigma[0] * np.sin(2.0 * np.pi * np.arange(count) / samples)
+    covariance = covariance_of(replace(result, residuals=slow), experiments)
     sizes = np.linalg.eigvalsh(covariance)
     assert sizes[0] >= -1e-9 * sizes[-1]
     assert np.all(np.diag(covariance) > 0.0)

@@ -43,8 +43,8 @@ def given() -> Record:
 
 
 def scaled(given: Record, t: float = 1.0, v: float = 1.0, y: float = 1.0) -> Record:
-    shown = y * np.asarray(given.displacement)
-    return replace(given, time=t * given.time, voltage=v * given.voltage, displacement=shown)
+    displayed = y * np.asarray(given.displacement)
+    return replace(given, time=t * given.time, voltage=v * given.voltage, displacement=displayed)
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_sign_and_time_are_doubted(given: Record) -> None:
     assert "(--columns time=NAME:ms)" in doubtful_time([scaled(given, t=1e6)])
     fast = doubtful_time([scaled(given, t=1e-4)])
     assert "few tests are above 0.1 m/s. The time is probably in s, not ms" in fast
-    found = identify([scaled(given, y=-1.0)])
-    assert "the other way round" in found.warnings[0]
+    result = identify([scaled(given, y=-1.0)])
+    assert "the other way round" in result.warnings[0]
 
 
 def test_a_stray_voltage_is_named_with_its_time(given: Record) -> None:
@@ -130,8 +130,8 @@ def test_however_slow_the_sampling_the_start_is_within_bounds(
 def test_a_spike_of_a_million_metres_moves_nothing(given: Record) -> None:
     y = np.asarray(given.displacement)
     spoiled = np.where(np.arange(600) == 300, 1e6, y)
-    found = diagnose([replace(given, displacement=spoiled)], effects=TABLE)
-    assert found.verdict == "adequate"
+    result = diagnose([replace(given, displacement=spoiled)], effects=TABLE)
+    assert result.verdict == "adequate"
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, 0.6), (0.4, 1.0), (0.2, 0.8), (0.0, 0.95)])
@@ -139,20 +139,20 @@ def test_a_saturated_sensor_is_named_and_masked(low: float, high: float, given: 
     y = np.asarray(given.displacement)
     ends = y.min() + np.array([low, high]) * np.ptp(y)
     record = replace(given, displacement=np.clip(y, *ends))
-    found = suspects(record)
+    result = suspects(record)
     flat = (y <= ends[0]) & (low > 0.0) | (y >= ends[1]) & (high < 1.0)
-    assert np.mean(found.mask != flat) < 0.01
-    assert [e.upper for e in found.ends] == [False] * (low > 0.0) + [True] * (high < 1.0)
+    assert np.mean(result.mask != flat) < 0.01
+    assert [e.upper for e in result.ends] == [False] * (low > 0.0) + [True] * (high < 1.0)
     value = 1e6 * ends[1 if high < 1.0 else 0]
-    assert f"{value:.6g} µm" in str(found.saturation("r")[-1])
+    assert f"{value:.6g} µm" in str(result.saturation("r")[-1])
 
 
 def test_a_saturated_record_is_diagnosed_without_its_flat_top(given: Record) -> None:
     y = np.asarray(given.displacement)
     record = replace(given, displacement=np.minimum(y, y.min() + 0.6 * np.ptp(y)))
-    found = diagnose([record], effects=TABLE)
-    assert found.verdict == "adequate"
-    assert "the largest value, while the voltage moves the stack: the sensor" in found.notes[-1]
+    result = diagnose([record], effects=TABLE)
+    assert result.verdict == "adequate"
+    assert "the largest value, while the voltage moves the stack: the sensor" in result.notes[-1]
 
 
 def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(given: Record) -> None:
@@ -167,8 +167,8 @@ def test_what_is_flat_for_other_reasons_is_not_a_saturated_sensor(given: Record)
 def test_a_coarse_sensor_is_named(given: Record) -> None:
     y = np.asarray(given.displacement)
     quantum = np.ptp(y) / 9.0
-    found = diagnose([replace(given, displacement=quantum * np.round(y / quantum))], effects=TABLE)
-    assert found.notes[-1].startswith("What is left of r is rounding to steps of 3.2 µm;")
+    result = diagnose([replace(given, displacement=quantum * np.round(y / quantum))], effects=TABLE)
+    assert result.notes[-1].startswith("What is left of r is rounding to steps of 3.2 µm;")
 
 
 def test_hardly_a_reading_left_is_refused_with_the_reason(given: Record) -> None:
@@ -215,9 +215,9 @@ def test_a_voltage_in_counts_is_doubted(given: Record) -> None:
     voltage = given.voltage
     assert not doubtful_voltage([scaled(given)])
     counts = replace(given, voltage=np.round(32768.0 + 200.0 * voltage))
-    found = diagnose([counts], effects=[])
-    assert "no stack bears such a voltage, and what depends on its level" in found.doubt
-    assert any("no stack bears more than 2000 V" in note for note in found.notes)
+    result = diagnose([counts], effects=[])
+    assert "no stack bears such a voltage, and what depends on its level" in result.doubt
+    assert any("no stack bears more than 2000 V" in note for note in result.notes)
 
 
 def test_hardly_a_reading_that_differs_is_refused(given: Record) -> None:
@@ -250,17 +250,17 @@ def test_an_odd_record_of_a_sound_stack_is_adequate(
 ) -> None:
     """A record that starts late, noise with heavy tails, runs of missing readings."""
     y = np.asarray(given.displacement)
-    found = diagnose(
+    result = diagnose(
         [replace(given, time=given.time + late, displacement=change(y))], effects=TABLE
     )
-    assert found.verdict == "adequate"
-    assert not found.doubt
+    assert result.verdict == "adequate"
+    assert not result.doubt
 
 
 @pytest.mark.slow
 def test_a_voltage_with_the_other_sign_is_told(given: Record) -> None:
     voltage = given.voltage
-    found = diagnose([replace(given, voltage=-voltage)], effects=TABLE)
-    assert found.verdict == "not_driven"
-    assert any("connected the other way round" in note for note in found.notes)
-    assert found.next_experiment.why.startswith("Correct the record")
+    result = diagnose([replace(given, voltage=-voltage)], effects=TABLE)
+    assert result.verdict == "not_driven"
+    assert any("connected the other way round" in note for note in result.notes)
+    assert result.next_experiment.why.startswith("Correct the record")

@@ -50,23 +50,23 @@ def allowed(experiment: Experiment, sigma: float) -> float:
 
 def test_a_fit_tells_way_and_error_of_each_record() -> None:
     experiments = [whole(regular()), whole(jittered(SIGMA, 2))]
-    found = fitted(experiments, SIGMA)
-    assert [s.way for s in found.simulated] == [EXACT, STEPPER]
-    assert found.simulated[0].error <= allowed(experiments[0], SIGMA)
-    assert found.simulated[1].error <= allowed(experiments[1], SIGMA)
-    assert not found.way.stepped
-    assert found.rms == pytest.approx(SIGMA, rel=0.15)
+    result = fitted(experiments, SIGMA)
+    assert [s.way for s in result.simulated] == [EXACT, STEPPER]
+    assert result.simulated[0].error <= allowed(experiments[0], SIGMA)
+    assert result.simulated[1].error <= allowed(experiments[1], SIGMA)
+    assert not result.way.stepped
+    assert result.rms == pytest.approx(SIGMA, rel=0.15)
 
 
 def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
     """An estimate by a finer run: right within a factor, unless it is far below what counts."""
     experiments = [whole(regular())]
-    found = fitted(experiments, SIGMA)
-    fine = simulated_by(found, experiments, Way(1e-10, 1e-10, stepped=True))
-    gap = float(np.sqrt(np.mean((found.predicted(experiments)[0] - fine) ** 2)))
+    result = fitted(experiments, SIGMA)
+    fine = simulated_by(result, experiments, Way(1e-10, 1e-10, stepped=True))
+    gap = float(np.sqrt(np.mean((result.predicted(experiments)[0] - fine) ** 2)))
     limit = allowed(experiments[0], SIGMA)
     assert gap <= limit
-    assert gap <= 3.0 * found.simulated[0].error + 0.03 * limit
+    assert gap <= 3.0 * result.simulated[0].error + 0.03 * limit
 
 
 def simulated_by(found: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
@@ -77,12 +77,12 @@ def simulated_by(found: Fit, experiments: list[Experiment], way: Way) -> FloatAr
 @pytest.mark.parametrize("sigma", [1e-9, 1e-12])
 def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None:
     experiments = [whole(regular(sigma))]
-    found = fitted(experiments, sigma)
-    told = found.simulated[0]
+    result = fitted(experiments, sigma)
+    output = result.simulated[0]
     limit = allowed(experiments[0], sigma)
-    assert told.way == STEPPER or told.error <= limit
-    fine = simulated_by(found, experiments, Way(1e-11, 1e-11, stepped=True))
-    gap = found.predicted(experiments)[0] - fine
+    assert output.way == STEPPER or output.error <= limit
+    fine = simulated_by(result, experiments, Way(1e-11, 1e-11, stepped=True))
+    gap = result.predicted(experiments)[0] - fine
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit
 
 
@@ -102,10 +102,10 @@ ALLOWED, OF_DELTA = 2e-3, 1e-2
 
 def unknowns_of(name: str, model: Model) -> list[str | int]:
     """Return the effect's own parameters, some of the base, and initial states."""
-    own = [] if name == "base" else [p.name for p in EFFECTS[name].parameters]
+    item = [] if name == "base" else [p.name for p in EFFECTS[name].parameters]
     memories = [s.name for s in model.structure.states if s.memory]
     starts = [model.state_names.index(n) for n in (*memories, "f_out")]
-    return [*own, *BASE_UNKNOWNS, *starts]
+    return [*item, *BASE_UNKNOWNS, *starts]
 
 
 def derived_record(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -128,10 +128,10 @@ def columns(name: str, tolerance: float) -> tuple[list[str | int], FloatArray, F
     t, u, x0 = derived_record(model)
     unknowns = unknowns_of(name, model)
     s0 = initial(model, unknowns)
-    asked: Any = {"unknowns": unknowns, "s0": s0, "outputs": (OUTPUT,)}
-    found = run_exact(model, t, u, x0, tolerance=tolerance, **asked)
-    own = run(model, t, u, x0, rtol=1e-12, **asked)
-    return unknowns, found.sensitivity[:, 0], own.sensitivity[:, 0]
+    requested: Any = {"unknowns": unknowns, "s0": s0, "outputs": (OUTPUT,)}
+    exact_steps = run_exact(model, t, u, x0, tolerance=tolerance, **requested)
+    item = run(model, t, u, x0, rtol=1e-12, **requested)
+    return unknowns, exact_steps.sensitivity[:, 0], item.sensitivity[:, 0]
 
 
 def off(found: FloatArray, true: FloatArray) -> float:
@@ -143,8 +143,8 @@ def off(found: FloatArray, true: FloatArray) -> float:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_are_the_stepper_s(name: str) -> None:
-    unknowns, found, own = columns(name, 1e-8)
-    gaps = {q: off(found[:, k], own[:, k]) for k, q in enumerate(unknowns)}
+    unknowns, result, item = columns(name, 1e-8)
+    gaps = {q: off(result[:, k], item[:, k]) for k, q in enumerate(unknowns)}
     for unknown, gap in gaps.items():
         assert gap < (OF_DELTA if unknown == "delta" else ALLOWED), unknown
 

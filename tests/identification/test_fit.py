@@ -91,8 +91,8 @@ def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, 
     x, exact = predicted(theta)
     assert exact.shape == (240, unknowns.size)
     for k, h in enumerate(step * np.eye(unknowns.size)):
-        found = (predicted(theta + h)[0] - predicted(theta - h)[0]) / (2 * step)
-        error, size = found - exact[:, k], exact[:, k]
+        result = (predicted(theta + h)[0] - predicted(theta - h)[0]) / (2 * step)
+        error, size = result - exact[:, k], exact[:, k]
         assert np.abs(error).max() < 2e-3 * np.abs(size).max() + 1e-6 * np.ptp(x) / step
         assert np.sqrt(np.mean(error**2)) < 0.05 * np.sqrt(np.mean(size**2))
 
@@ -109,16 +109,16 @@ def test_missing_samples_are_ignored() -> None:
     as_nan = replace(record, displacement=np.where(lost, np.nan, y))
     as_wild = replace(record, displacement=np.where(lost, rng.uniform(-1.0, 1.0, record.n), y))
     none = np.zeros(record.n, dtype=np.bool_)
-    found = [
+    items = [
         fitted(model, [e]) for e in (whole(as_nan), Experiment(as_wild, ~lost, none), whole(record))
     ]
-    np.testing.assert_array_equal(found[0].theta, found[1].theta)
-    np.testing.assert_array_equal(found[0].residuals, found[1].residuals)
-    assert len(found[0].residuals) == record.n - np.count_nonzero(lost)
-    assert found[0].rms == pytest.approx(SIGMA, rel=0.1)
+    np.testing.assert_array_equal(items[0].theta, items[1].theta)
+    np.testing.assert_array_equal(items[0].residuals, items[1].residuals)
+    assert len(items[0].residuals) == record.n - np.count_nonzero(lost)
+    assert items[0].rms == pytest.approx(SIGMA, rel=0.1)
     for name in ("k_L", "A"):
-        assert found[0].model.values[name] == pytest.approx(found[2].model.values[name], rel=0.02)
-    assert found[0].model.values["k_L"] != found[2].model.values["k_L"]
+        assert items[0].model.values[name] == pytest.approx(items[2].model.values[name], rel=0.02)
+    assert items[0].model.values["k_L"] != items[2].model.values["k_L"]
 
 
 def fitted(model: Model, experiments: Sequence[Experiment]) -> Fit:
@@ -130,23 +130,23 @@ def fitted(model: Model, experiments: Sequence[Experiment]) -> Fit:
 def test_the_parts_of_a_fit_belong_together() -> None:
     model = model_with()
     experiments = [whole(record_of(model, seed)) for seed in (1, 2)]
-    found = fitted(model, experiments)
-    assert found.converged
-    assert found.sigma == (SIGMA, SIGMA)
+    result = fitted(model, experiments)
+    assert result.converged
+    assert result.sigma == (SIGMA, SIGMA)
     measured = np.concatenate([np.asarray(e.record.displacement) for e in experiments])
-    predicted = np.concatenate(found.predicted(experiments))
-    np.testing.assert_allclose(found.residuals, measured - predicted, rtol=0, atol=1e-3 * SIGMA)
-    priors = found.theta / found.unknowns.prior
-    cost = np.sum((found.residuals / SIGMA) ** 2) + np.sum(priors**2)
-    assert found.cost == pytest.approx(cost, rel=1e-12)
-    gradient = -found.jacobian.T @ found.residuals / SIGMA**2 + priors / found.unknowns.prior
-    size = np.linalg.norm(found.jacobian / SIGMA, axis=0)
-    low, high = found.unknowns.bounds()
-    pushed = np.where(found.theta <= low, np.minimum(gradient, 0.0), gradient)
-    pushed = np.where(found.theta >= high, np.maximum(gradient, 0.0), pushed)
+    predicted = np.concatenate(result.predicted(experiments))
+    np.testing.assert_allclose(result.residuals, measured - predicted, rtol=0, atol=1e-3 * SIGMA)
+    priors = result.theta / result.unknowns.prior
+    cost = np.sum((result.residuals / SIGMA) ** 2) + np.sum(priors**2)
+    assert result.cost == pytest.approx(cost, rel=1e-12)
+    gradient = -result.jacobian.T @ result.residuals / SIGMA**2 + priors / result.unknowns.prior
+    size = np.linalg.norm(result.jacobian / SIGMA, axis=0)
+    low, high = result.unknowns.bounds()
+    pushed = np.where(result.theta <= low, np.minimum(gradient, 0.0), gradient)
+    pushed = np.where(result.theta >= high, np.maximum(gradient, 0.0), pushed)
     assert np.all(np.abs(pushed) < 0.1 * size)  # within a tenth of a standard deviation
-    assert found.offset(1) - found.offset(0) == pytest.approx(1e-6, abs=SIGMA)
-    assert abs(found.start(0)["f_H"]) < 3.0
+    assert result.offset(1) - result.offset(0) == pytest.approx(1e-6, abs=SIGMA)
+    assert abs(result.start(0)["f_H"]) < 3.0
 
 
 def _after_a_history(model: Model, peak: float, seed: int) -> Record:
@@ -175,10 +175,10 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     lead = np.arange(held.n) < held.n // 10
     wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
     experiments = divided(records[:2], [replace(held, displacement=wrong)])
-    found = fitted(model, experiments)
-    shared, own = found.predicted(experiments)[2], _from_its_own_beginning(found, experiments[2])
+    result = fitted(model, experiments)
+    shared, item = result.predicted(experiments)[2], _from_its_own_beginning(result, experiments[2])
     truth = np.asarray(held.displacement)[~lead]
-    errors = [float(np.std(x[~lead] - truth)) for x in (shared, own)]
+    errors = [float(np.std(x[~lead] - truth)) for x in (shared, item)]
     assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
     # one that begins at another voltage has its own start
     other = record_of(model, 5)
@@ -204,11 +204,11 @@ def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
     fits = [fitted(model, divided(records[:2], [held])) for held in others]
     alone = fitted(model, [whole(r) for r in records[:2]])
     count = alone.unknowns.size
-    for found in fits:
-        np.testing.assert_allclose(found.theta[:count], alone.theta, rtol=1e-6)
-        np.testing.assert_allclose(found.residuals, alone.residuals, rtol=0, atol=1e-6 * SIGMA)
-        assert not np.any(found.theta[count:])
-        assert not np.any(found.jacobian[:, count:])
+    for result in fits:
+        np.testing.assert_allclose(result.theta[:count], alone.theta, rtol=1e-6)
+        np.testing.assert_allclose(result.residuals, alone.residuals, rtol=0, atol=1e-6 * SIGMA)
+        assert not np.any(result.theta[count:])
+        assert not np.any(result.jacobian[:, count:])
     # nor does the search for where a fit begins
     bases = [fit_base(model, divided(records[:2], [held])) for held in others]
     assert bases[0].model.values == bases[1].model.values
@@ -223,16 +223,16 @@ def test_a_loop_that_has_left_the_record_far_behind_has_diverged(
     """Its numbers are finite; their squares overflow, or each evaluation would take far longer."""
     model = model_with()
     experiments = [whole(record_of(model, 1))]
-    found = fitted(model, experiments)
-    evaluate = Objective(model, experiments, found.unknowns, [SIGMA], found.way)
+    result = fitted(model, experiments)
+    evaluate = Objective(model, experiments, result.unknowns, [SIGMA], result.way)
     samples = experiments[0].record.n
     far = np.full(samples, ranges * experiments[0].record.range_m)
-    slopes = np.full((samples, found.unknowns.size), slope)
+    slopes = np.full((samples, result.unknowns.size), slope)
     monkeypatch.setattr(
         "psa_casadi.identification.fitting.fit.predict",
         lambda *_, **__: [Prediction(far, slopes, "exact")],
     )
-    assert (evaluate(found.theta) is not None) == evaluated
+    assert (evaluate(result.theta) is not None) == evaluated
 
 
 def test_a_fit_without_samples_is_refused() -> None:
@@ -276,8 +276,8 @@ def test_fits_of_one_minimum_are_the_same_place_wherever_their_priors_count_from
     near = fit(model, experiments, free, sigma=[2e-9])
     far = fit(off, experiments, free, sigma=[2e-9], start={"c_B": right})
     assert far.cost > near.cost + 45.0
-    for found in (near, far):
-        squares = float(np.sum((found.residuals / 2e-9) ** 2))
-        assert found.data_cost == pytest.approx(squares, rel=1e-9)
+    for result in (near, far):
+        squares = float(np.sum((result.residuals / 2e-9) ** 2))
+        assert result.data_cost == pytest.approx(squares, rel=1e-9)
     assert far.data_cost == pytest.approx(near.data_cost, abs=0.1)
     assert same_place(near, far, experiments)

@@ -71,12 +71,12 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
     for name in COLUMNS:
         np.testing.assert_allclose(getattr(read, name), getattr(r, name), rtol=1e-6, atol=1e-12)
     start = starting_model([read])
-    found = columns_of(start, [read])
-    assert found.fitted == tuple(COLUMNS)
-    assert not found.left_out
-    experiments = with_levels([whole(read)], found.fitted)
+    result = columns_of(start, [read])
+    assert result.fitted == tuple(COLUMNS)
+    assert not result.left_out
+    experiments = with_levels([whole(read)], result.fitted)
     free = ["k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s"]
-    fitted = fit(found.model, experiments, free, sigma=[plants.NOISE * read.range_m])
+    fitted = fit(result.model, experiments, free, sigma=[plants.NOISE * read.range_m])
     p = fitted.model.values
     assert p["monitor_scale"] == pytest.approx(0.01, rel=3e-3)
     assert p["sensor_2_scale"] == pytest.approx(0.83, rel=3e-3)
@@ -85,24 +85,24 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
         if f.column == "current":  # which shows lags that the displacement does not tell
             assert f.rms < 2.0 * f.straight
             continue
-        given = {n: getattr(read, n) for n in COLUMNS}[f.column]
-        assert f.rms == pytest.approx(plants.FURTHER_NOISE * np.ptp(given), rel=0.2), f.column
+        inputs = {n: getattr(read, n) for n in COLUMNS}[f.column]
+        assert f.rms == pytest.approx(plants.FURTHER_NOISE * np.ptp(inputs), rel=0.2), f.column
     # a charge tells the capacitance of the free stack, with what the displacement frees
-    told = capacitance_of([replace(read, current=None)])
-    assert told is not None
-    assert told.source == "charge"
+    capacitance = capacitance_of([replace(read, current=None)])
+    assert capacitance is not None
+    assert capacitance.source == "charge"
     stack, slope = truth.run.stack, np.polyfit(truth.voltage, truth.displacement, 1)[0]
-    assert told.value == pytest.approx(stack.c_p_el + stack.k_l * slope, rel=0.05)
+    assert capacitance.value == pytest.approx(stack.c_p_el + stack.k_l * slope, rel=0.05)
 
 
 @slow
 def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> None:
     r = plants.plain(1).record(1, "charge", "monitor_voltage", samples=300)
-    found = columns_of(starting_model([r]), [r])
-    experiments = with_levels([whole(r)], found.fitted)
-    some = fit(found.model, experiments, ["k_L", "A", "R_s"], sigma=[1e-8], evaluations=1)
+    result = columns_of(starting_model([r]), [r])
+    experiments = with_levels([whole(r)], result.fitted)
+    some = fit(result.model, experiments, ["k_L", "A", "R_s"], sigma=[1e-8], evaluations=1)
     way = Way(1e-9, 1e-9)
-    evaluate = Objective(found.model, experiments, some.unknowns, [1e-8], way)
+    evaluate = Objective(result.model, experiments, some.unknowns, [1e-8], way)
     theta, rows = some.theta, slice(300, 900)
     at = evaluate(theta)
     assert at is not None
@@ -129,13 +129,13 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
     )
     with pytest.raises(InputError, match="'monitor_voltage', but the model 'psa' does not give it"):
         columns_of(compose([FLEXURE]), [r])
-    found = columns_of(starting_model([r]), [r])
-    assert found.fitted == ("monitor_voltage",)
-    assert texts(found.left_out) == ("strain is left out: it never changes.",)
-    assert "monitor_voltage" in found.model.output_names
+    result = columns_of(starting_model([r]), [r])
+    assert result.fitted == ("monitor_voltage",)
+    assert texts(result.left_out) == ("strain is left out: it never changes.",)
+    assert "monitor_voltage" in result.model.output_names
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
-    (said,) = columns_of(starting_model([turned]), [turned]).left_out
-    assert "does not follow the voltage as a capacitance's does" in str(said)
+    (statement,) = columns_of(starting_model([turned]), [turned]).left_out
+    assert "does not follow the voltage as a capacitance's does" in str(statement)
     with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
@@ -143,11 +143,11 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
 def test_a_turned_sign_is_told() -> None:
     r = plants.plain(1).record(1, "charge", samples=400)
     turned = replace(r, charge=-np.asarray(r.charge))
-    for record, told in ((r, False), (turned, True)):
-        found = columns_of(starting_model([record]), [record])
-        experiments = with_levels([whole(record)], found.fitted)
-        (further,) = fit(found.model, experiments, [], sigma=[1e-8], evaluations=1).further
-        assert ("its sign is probably turned" in texts(further.notes)[-1]) is told
+    for record, output in ((r, False), (turned, True)):
+        result = columns_of(starting_model([record]), [record])
+        experiments = with_levels([whole(record)], result.fitted)
+        (further,) = fit(result.model, experiments, [], sigma=[1e-8], evaluations=1).further
+        assert ("its sign is probably turned" in texts(further.notes)[-1]) is output
 
 
 @pytest.mark.parametrize(
@@ -180,32 +180,34 @@ def test_a_column_explains_nothing_where_something_is_left() -> None:
 
 def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:
     r = plants.plain(1).record(1, "displacement_2", samples=400)
-    found = columns_of(starting_model([r]), [r])
-    some = fit(found.model, with_levels([split(r)], found.fitted), [], sigma=[1e-8], evaluations=1)
+    result = columns_of(starting_model([r]), [r])
+    some = fit(
+        result.model, with_levels([split(r)], result.fitted), [], sigma=[1e-8], evaluations=1
+    )
     (further,) = some.further
     assert further.straight == pytest.approx(1e-3 * further.spread)
-    model, (beside,) = scaled(some.model, some.further)
+    model, (others,) = scaled(some.model, some.further)
     assert model.values == pytest.approx(some.model.values)  # the scale is in the model already
-    assert beside.factors == pytest.approx([1.0])
+    assert others.factors == pytest.approx([1.0])
     assert "displacement_2: fitted beside the displacement" in str(further.notes[0])
 
 
 @slow
 def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
     right = "sensor_nonlinearity"
-    found = diagnosed(plants.bent_sensor, 0.03, "displacement_2", BENDS)
-    assert [c.effect for c in found.causes] == [right]
-    assert found.causes[0].cannot_be_told_from == ()
-    (decided,) = found.columns
+    result = diagnosed(plants.bent_sensor, 0.03, "displacement_2", BENDS)
+    assert [c.effect for c in result.causes] == [right]
+    assert result.causes[0].cannot_be_told_from == ()
+    (decided,) = result.columns
     assert set(decided.named_without) == set(BENDS)
     assert decided.ruled_out == tuple(n for n in decided.named_without if n != right)
     assert decided.base_rms is not None
     assert decided.noise == pytest.approx(decided.extended_rms, rel=0.1)
     assert decided.evidence > 20.0
-    said = " ".join(psa.story(found).split())
-    assert "With displacement_2 the stack with its load is ruled out" in said
-    assert json.loads(found.to_json())["columns"][0]["named"] == {right: pytest.approx(1.0)}
-    write_report(found, tmp_path / "page.html", still=True)
+    text = " ".join(psa.story(result).split())
+    assert "With displacement_2 the stack with its load is ruled out" in text
+    assert json.loads(result.to_json())["columns"][0]["named"] == {right: pytest.approx(1.0)}
+    write_report(result, tmp_path / "page.html", still=True)
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "What the further columns decided" in page
     assert "With displacement_2" in page
@@ -239,9 +241,9 @@ def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
 def test_a_monitor_voltage_tells_the_amplifier_from_the_stack(
     hide: Hide, right: str, place: str
 ) -> None:
-    found = diagnosed(hide, 0.1, "monitor_voltage", VOLTAGES, "triangle")
-    assert [c.effect for c in found.causes] == [right]
-    (decided,) = found.columns
+    result = diagnosed(hide, 0.1, "monitor_voltage", VOLTAGES, "triangle")
+    assert [c.effect for c in result.causes] == [right]
+    (decided,) = result.columns
     assert set(decided.named_without) == set(VOLTAGES)
     assert f"{place} is ruled out" in decided.sentence
     assert decided.named[right] > 0.99
@@ -249,9 +251,9 @@ def test_a_monitor_voltage_tells_the_amplifier_from_the_stack(
 
 @slow
 def test_a_capacitance_that_grows_shows_in_the_charge_alone() -> None:
-    found = diagnosed(plants.growing_capacitance, 0.3, "charge", CHARGES, seed=1)
-    assert [c.effect for c in found.causes] == ["field_dependent_capacitance"]
-    (decided,) = found.columns
+    result = diagnosed(plants.growing_capacitance, 0.3, "charge", CHARGES, seed=1)
+    assert [c.effect for c in result.causes] == ["field_dependent_capacitance"]
+    (decided,) = result.columns
     assert decided.named_without == {}
     assert "Only with charge" in decided.sentence
 
@@ -259,8 +261,8 @@ def test_a_capacitance_that_grows_shows_in_the_charge_alone() -> None:
 @slow
 def test_a_column_of_a_clean_stack_raises_no_alarm() -> None:
     record = plants.plain(2).record(2, "current", samples=SAMPLES)
-    found = psa.diagnose([record], effects=[EFFECTS[n] for n in (*VOLTAGES, *CHARGES)])
-    assert found.verdict == "adequate"
-    (decided,) = found.columns
+    result = psa.diagnose([record], effects=[EFFECTS[n] for n in (*VOLTAGES, *CHARGES)])
+    assert result.verdict == "adequate"
+    (decided,) = result.columns
     assert "agrees with the model" in decided.sentence
     assert decided.base_rms == pytest.approx(decided.noise, rel=0.25)

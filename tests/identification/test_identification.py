@@ -30,48 +30,48 @@ pytestmark = pytest.mark.xdist_group("identification")
 
 @pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
 def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
-    truth, found = plant(seed)[0], identified(seed)
-    assert found.fit.converged
-    assert found.determinacy.on_bound == ()
-    assert found.fit.rms == pytest.approx(noise(truth), rel=0.05)
-    assert found.fit.sigma[0] == pytest.approx(noise(truth), rel=0.05)
-    clean = found.fit.predicted(found.experiments)[0] - truth.displacement
+    truth, result = plant(seed)[0], identified(seed)
+    assert result.fit.converged
+    assert result.determinacy.on_bound == ()
+    assert result.fit.rms == pytest.approx(noise(truth), rel=0.05)
+    assert result.fit.sigma[0] == pytest.approx(noise(truth), rel=0.05)
+    clean = result.fit.predicted(result.experiments)[0] - truth.displacement
     assert np.std(clean) < 0.12 * noise(truth)
     true = combinations(values_of(truth.stack))
     rated = {"u_rated": truth.stack.u_rated}
-    for name, value in combinations({**found.model.values, **rated}).items():
+    for name, value in combinations({**result.model.values, **rated}).items():
         assert value == pytest.approx(true[name], rel=TOLERANCE[name]), name
 
 
 @pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
 def test_what_is_not_determined_is_listed(seed: int) -> None:
     """Lags are short and alike: not all of them can be told."""
-    found = identified(seed).determinacy
-    assert {"tau", "R_s", "c_P", "c_B"} & set(found.undetermined)
-    assert not {"k_L", "A", "n"} & set(found.undetermined)
-    said = " ".join(w for w in identified(seed).warnings if "these records" in w)
-    assert all(f"'{name}'" in said for name in found.undetermined)
-    assert np.all(np.abs(found.correlations) < 1.0 + 1e-9)
-    np.testing.assert_allclose(np.diag(found.correlations), 1.0)
-    for name, interval in found.intervals.items():
+    result = identified(seed).determinacy
+    assert {"tau", "R_s", "c_P", "c_B"} & set(result.undetermined)
+    assert not {"k_L", "A", "n"} & set(result.undetermined)
+    text = " ".join(w for w in identified(seed).warnings if "these records" in w)
+    assert all(f"'{name}'" in text for name in result.undetermined)
+    assert np.all(np.abs(result.correlations) < 1.0 + 1e-9)
+    np.testing.assert_allclose(np.diag(result.correlations), 1.0)
+    for name, interval in result.intervals.items():
         assert interval.low < identified(seed).model.values[name] < interval.high
 
 
 @slow
 def test_a_given_stiffness_scales_the_forces() -> None:
     record = plant(2)[1].slice(0, 2500)
-    assumed, given = identify([record]), identify([record], stiffness=1e7)
+    assumed, inputs = identify([record]), identify([record], stiffness=1e7)
     assert assumed.model.provenance.force_scale == "assumed"
     assert "Force scale assumed" in assumed.model.provenance.notes[0]
-    assert given.model.provenance.force_scale == "given"
-    assert given.model.provenance.notes == ()
-    p = given.model.values
+    assert inputs.model.provenance.force_scale == "given"
+    assert inputs.model.provenance.notes == ()
+    p = inputs.model.values
     assert p["k_B"] == 1e7  # what a load on the output meets
     for name in ("k_L", "A"):
         assert p[name] == pytest.approx(assumed.model.values[name] / 5.0, rel=1e-2)
-    pair = [combinations(f.model.values) for f in (assumed, given)]
+    pair = [combinations(f.model.values) for f in (assumed, inputs)]
     assert pair[1]["slope"] == pytest.approx(pair[0]["slope"], rel=1e-3)
-    assert given.fit.rms == pytest.approx(assumed.fit.rms, rel=1e-3)
+    assert inputs.fit.rms == pytest.approx(assumed.fit.rms, rel=1e-3)
 
 
 def reference_record(p: dict[str, float], sigma: float) -> Record:
@@ -103,23 +103,23 @@ def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     """With stiffness and masses right, every parameter is in its interval, the lag tau too."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
     record = reference_record(p, 3e-4)
-    found = identify([record], model=start_model(p))
-    assert found.fit.converged
-    assert found.fit.rms == pytest.approx(3e-4 * record.range_m, rel=0.12)
+    result = identify([record], model=start_model(p))
+    assert result.fit.converged
+    assert result.fit.rms == pytest.approx(3e-4 * record.range_m, rel=0.12)
     for name in ("k_L", "A", "beta", "gamma", "delta", "n", "tau"):
-        error = found.determinacy.standard_errors[name]
-        assert abs(found.model.values[name] - p[name]) < 3.0 * error, name
-    assert found.model.values["tau"] == pytest.approx(p["tau"], rel=0.02)
+        error = result.determinacy.standard_errors[name]
+        assert abs(result.model.values[name] - p[name]) < 3.0 * error, name
+    assert result.model.values["tau"] == pytest.approx(p["tau"], rel=0.02)
 
 
 @slow
 def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
     """The model's exponent is at least 1; the reference bends with 0.6."""
     p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
-    found = identify([reference_record({**p, "n": 0.6}, 1e-4)], model=start_model(p))
-    assert found.model.values["n"] == 1.0
-    assert "n" in found.determinacy.on_bound
-    assert "'n' sits on a bound of its range; its interval means nothing." in found.warnings
+    result = identify([reference_record({**p, "n": 0.6}, 1e-4)], model=start_model(p))
+    assert result.model.values["n"] == 1.0
+    assert "n" in result.determinacy.on_bound
+    assert "'n' sits on a bound of its range; its interval means nothing." in result.warnings
 
 
 def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,8 +127,8 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     record = plant(2)[1].slice(0, 600)
     monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
     monkeypatch.setattr("psa_casadi.identification.exchanges._LAST", 1)
-    found = identify([record])
-    assert found.warnings[0].startswith("The fit was cut off before it converged")
+    result = identify([record])
+    assert result.warnings[0].startswith("The fit was cut off before it converged")
 
 
 def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
@@ -137,7 +137,7 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     def fails(*_: object, **__: object) -> None:
         raise SimulationError("the step size became too small")
 
-    found = identified(2)
-    first = found.fit
+    stack_identification = identified(2)
+    first = stack_identification.fit
     monkeypatch.setattr(refitting, "fit", fails)
-    assert refit_or_keep(first, found.experiments, sigma=first.sigma) is first
+    assert refit_or_keep(first, stack_identification.experiments, sigma=first.sigma) is first

@@ -25,20 +25,20 @@ def solved(found: Minimum | None) -> Minimum:
 
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (5.0, -30.0), (0.0, 0.0)])
 def test_rosenbrocks_valley(start: tuple[float, float]) -> None:
-    found = solved(minimise(rosenbrock, np.array(start), OPEN, tolerance=1e-10, evaluations=200))
-    np.testing.assert_allclose(found.theta, [1.0, 1.0], atol=1e-8)
-    assert found.cost < 1e-16
-    assert found.evaluations < 60
+    result = solved(minimise(rosenbrock, np.array(start), OPEN, tolerance=1e-10, evaluations=200))
+    np.testing.assert_allclose(result.theta, [1.0, 1.0], atol=1e-8)
+    assert result.cost < 1e-16
+    assert result.evaluations < 60
 
 
 def test_rosenbrocks_valley_behind_a_bound() -> None:
     """With x <= 0.5 the minimum lies on the bound, at y = x^2."""
     bounds = (np.array([-2.0, -2.0]), np.array([0.5, 2.0]))
     start = np.array([-1.2, 1.0])
-    found = solved(minimise(rosenbrock, start, bounds, tolerance=1e-10, evaluations=200))
-    assert found.theta[0] == 0.5
-    assert found.theta[1] == pytest.approx(0.25, abs=1e-6)
-    assert found.cost == pytest.approx(0.25, rel=1e-9)
+    result = solved(minimise(rosenbrock, start, bounds, tolerance=1e-10, evaluations=200))
+    assert result.theta[0] == 0.5
+    assert result.theta[1] == pytest.approx(0.25, abs=1e-6)
+    assert result.cost == pytest.approx(0.25, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -51,26 +51,26 @@ def test_linear_problems_in_a_box(seed: int) -> None:
     def evaluate(x: FloatArray) -> Pair:
         return a @ x - b, a
 
-    found = solved(minimise(evaluate, np.zeros(6), bounds, tolerance=1e-12, evaluations=300))
+    result = solved(minimise(evaluate, np.zeros(6), bounds, tolerance=1e-12, evaluations=300))
     true = lsq_linear(a, b, bounds, tol=1e-14, max_iter=1000)
     assert np.count_nonzero(np.abs(true.active_mask)) > 0
-    np.testing.assert_allclose(found.theta, true.x, atol=1e-5)
-    assert found.cost == pytest.approx(2.0 * true.cost, rel=1e-9)
-    np.testing.assert_array_equal((found.theta == 0.2).astype(int) - (found.theta == -0.15),
+    np.testing.assert_allclose(result.theta, true.x, atol=1e-5)
+    assert result.cost == pytest.approx(2.0 * true.cost, rel=1e-9)
+    np.testing.assert_array_equal((result.theta == 0.2).astype(int) - (result.theta == -0.15),
                                   np.sign(true.active_mask))  # fmt: skip
 
 
 def test_a_start_outside_the_box_is_moved_into_it() -> None:
-    seen: list[FloatArray] = []
+    arrays: list[FloatArray] = []
 
     def evaluate(x: FloatArray) -> Pair:
-        seen.append(x)
+        arrays.append(x)
         return x - 0.5, np.eye(2)
 
     box = (np.zeros(2), np.ones(2))
-    found = solved(minimise(evaluate, np.array([9.0, -9.0]), box, tolerance=1e-9, evaluations=50))
-    np.testing.assert_allclose(found.theta, 0.5, atol=1e-9)
-    assert all(np.all((x >= 0) & (x <= 1)) for x in seen)
+    result = solved(minimise(evaluate, np.array([9.0, -9.0]), box, tolerance=1e-9, evaluations=50))
+    np.testing.assert_allclose(result.theta, 0.5, atol=1e-9)
+    assert all(np.all((x >= 0) & (x <= 1)) for x in arrays)
 
 
 @pytest.mark.parametrize("size", [1e80, 1e160])
@@ -88,9 +88,9 @@ def test_a_step_into_overflow_is_taken_back() -> None:
     def cliff(x: FloatArray) -> Pair:
         return (np.full(1, 1e200), np.eye(1)) if x[0] > 2.0 else (x - 1.0, np.eye(1))
 
-    found = solved(minimise(cliff, np.full(1, -4.0), (OPEN[0][:1], OPEN[1][:1]), tolerance=1e-9,
+    result = solved(minimise(cliff, np.full(1, -4.0), (OPEN[0][:1], OPEN[1][:1]), tolerance=1e-9,
                             evaluations=50, radius=20.0))  # fmt: skip
-    np.testing.assert_allclose(found.theta, 1.0, atol=1e-9)
+    np.testing.assert_allclose(result.theta, 1.0, atol=1e-9)
 
 
 def test_what_cannot_be_evaluated() -> None:
@@ -102,20 +102,20 @@ def test_what_cannot_be_evaluated() -> None:
 
     start = np.array([-2.0, 0.0])
     assert minimise(nowhere, start, OPEN, tolerance=1e-9, evaluations=50) is None
-    found = solved(minimise(left_of_one, start, OPEN, tolerance=1e-9, evaluations=100))
-    np.testing.assert_allclose(found.theta, 0.98, atol=1e-6)
+    result = solved(minimise(left_of_one, start, OPEN, tolerance=1e-9, evaluations=100))
+    np.testing.assert_allclose(result.theta, 0.98, atol=1e-6)
 
 
 def test_an_iteration_that_is_cut_off_says_so() -> None:
     start = np.array([-1.2, 1.0])
-    found = minimise(rosenbrock, start, OPEN, tolerance=1e-10, evaluations=4)
-    assert found is not None
-    assert (found.converged, found.evaluations) == (False, 4)
-    residual, jacobian = rosenbrock(found.theta)
-    np.testing.assert_array_equal(found.residual, residual)
-    np.testing.assert_array_equal(found.jacobian, jacobian)
-    assert found.cost == residual @ residual
-    assert found.cost < 24.2
+    minimum = minimise(rosenbrock, start, OPEN, tolerance=1e-10, evaluations=4)
+    assert minimum is not None
+    assert (minimum.converged, minimum.evaluations) == (False, 4)
+    residual, jacobian = rosenbrock(minimum.theta)
+    np.testing.assert_array_equal(minimum.residual, residual)
+    np.testing.assert_array_equal(minimum.jacobian, jacobian)
+    assert minimum.cost == residual @ residual
+    assert minimum.cost < 24.2
 
 
 def shifted(x: FloatArray) -> Pair:
@@ -132,9 +132,9 @@ def test_linear_coordinates_are_best_from_the_first_evaluation_on() -> None:
     assert first is not None
     assert first.theta[2] == pytest.approx(1e3 - 1.44)
     assert first.cost == pytest.approx(float(np.sum(rosenbrock(start[:2])[0] ** 2)))
-    found = solved(minimise(shifted, start, none, tolerance=1e-10, evaluations=200, linear=[2]))
-    np.testing.assert_allclose(found.theta, [1.0, 1.0, 1e3 - 1.0], atol=1e-7)
-    assert found.evaluations < 30
+    result = solved(minimise(shifted, start, none, tolerance=1e-10, evaluations=200, linear=[2]))
+    np.testing.assert_allclose(result.theta, [1.0, 1.0, 1e3 - 1.0], atol=1e-7)
+    assert result.evaluations < 30
 
 
 def test_a_goal_out_of_reach_ends_the_search() -> None:
@@ -166,23 +166,23 @@ def test_a_short_step_does_not_end_a_search_for_a_goal_within_reach(
         residual = np.array([steep * (x[1] - x[0] ** 2), 1.0 - x[0]])
         return residual, np.array([[-2.0 * steep * x[0], steep], [-1.0, 0.0]])
 
-    found = minimise(valley, np.array(begun), OPEN, tolerance=1e-10, evaluations=200, goal=1e-2)
-    assert found is not None
-    assert found.cost < 1e-2
+    minimum = minimise(valley, np.array(begun), OPEN, tolerance=1e-10, evaluations=200, goal=1e-2)
+    assert minimum is not None
+    assert minimum.cost < 1e-2
 
 
-def noisy_valley(begun: tuple[float, float], steep: float, *, patient: bool) -> Minimum:
+def noisy_valley(started: tuple[float, float], steep: float, *, patient: bool) -> Minimum:
     """Search Rosenbrock's valley above noise of 100, which hides what short steps gain."""
 
     def above(x: FloatArray) -> Pair:
         residual = np.array([steep * (x[1] - x[0] ** 2), 1.0 - x[0], 10.0])
         return residual, np.array([[-2.0 * steep * x[0], steep], [-1.0, 0.0], [0.0, 0.0]])
 
-    start, most = np.array(begun), 500
-    found = minimise(
+    start, most = np.array(started), 500
+    minimum = minimise(
         above, start, OPEN, tolerance=1e-3, evaluations=most, radius=0.1, patient=patient
     )
-    return solved(found)
+    return solved(minimum)
 
 
 @pytest.mark.parametrize("steep", [30.0, 100.0, 300.0, 1000.0])

@@ -35,18 +35,18 @@ def test_equal_poles_are_no_singularity(q: float) -> None:
     x, h = np.minimum(np.arange(600) / 3.0, 1.0), 1e-6
     theta = np.log([2e-5, 4e-5, 2e-5, q, 2e-5, q, 5.0])
     apart = np.log([2e-5, 4e-5, 2.2e-5, 1e-10, 2e-5, 0.9e-10, 5.0])
-    found, near = (respond(mechanics_poles(t), numerator_time(t), x, h) for t in (theta, apart))
-    assert found[-1] == pytest.approx(1.0, abs=1e-4)
-    assert np.max(np.abs(found - near)) < 0.05
+    result, near = (respond(mechanics_poles(t), numerator_time(t), x, h) for t in (theta, apart))
+    assert result[-1] == pytest.approx(1.0, abs=1e-4)
+    assert np.max(np.abs(result - near)) < 0.05
 
 
 def test_play_operators_follow_their_recursion() -> None:
     u = np.cumsum(np.random.default_rng(3).standard_normal(777))
     radii = np.array([0.5, 3.0, 20.0])
     state = np.full(3, u[0])
-    for value, found in zip(u, plays(u, radii), strict=True):
+    for value, result in zip(u, plays(u, radii), strict=True):
         state = np.minimum(np.maximum(state, value - radii), value + radii)
-        assert np.array_equal(found, state)
+        assert np.array_equal(result, state)
 
 
 def test_vector_fitting_finds_the_poles() -> None:
@@ -62,9 +62,9 @@ def test_vector_fitting_finds_the_poles() -> None:
 
 
 def test_every_arrangement_holds_the_poles_it_is_given() -> None:
-    given = np.array([-1e3, -8e3, -2e3 + 3e4j, -2e3 - 3e4j])
-    for theta in arrangements(given, 1e-6):
+    inputs = np.array([-1e3, -8e3, -2e3 + 3e4j, -2e3 - 3e4j])
+    for theta in arrangements(inputs, 1e-6):
         placed = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
-        for pole in given:
+        for pole in inputs:
             assert np.min(np.abs(placed - pole)) < 1e-6 * abs(pole)
-    assert len(arrangements(given, 1e-6)) > 2
+    assert len(arrangements(inputs, 1e-6)) > 2

@@ -73,11 +73,12 @@ def errors(found: LinearStart | None, truth: Values, record: Record) -> list[flo
     base = starting_model([record]).values
     f = np.geomspace(1.0 / record.duration, 0.25 / record.sample_time, 200)
     true = transfer(theta_of(truth), f)
-    seen = np.abs(true) > 0.01
-    missed = [
-        transfer(theta_of({**base, **c.values}), f)[seen] - true[seen] for c in found.candidates
+    observed = np.abs(true) > 0.01
+    items = [
+        transfer(theta_of({**base, **c.values}), f)[observed] - true[observed]
+        for c in found.candidates
     ]
-    return [float(np.linalg.norm(m) / np.linalg.norm(true[seen])) for m in missed]
+    return [float(np.linalg.norm(m) / np.linalg.norm(true[observed])) for m in items]
 
 
 def start(*records: Record) -> LinearStart | None:
@@ -96,24 +97,24 @@ STEP_ERRORS = [
 )
 def test_a_step_tells_the_transfer_function(name: str, share: float, first: float) -> None:
     record = step(name, share)
-    found = start(record)
-    missed = errors(found, values_of(name), record)
-    assert found is not None
-    assert missed[0] < first
-    assert min(missed) < 0.06
-    assert found.candidates[0].misfit == pytest.approx(share, rel=0.1)
-    assert len(found.candidates) <= 4
+    result = start(record)
+    misfit = errors(result, values_of(name), record)
+    assert result is not None
+    assert misfit[0] < first
+    assert min(misfit) < 0.06
+    assert result.candidates[0].misfit == pytest.approx(share, rel=0.1)
+    assert len(result.candidates) <= 4
 
 
 def test_a_ringing_step_tells_the_bonding_layers() -> None:
     """Wafers and bonding layers exchanged respond almost alike: both are among the candidates."""
     record, truth = step("PTBS200", 1e-3), values_of("PTBS200")
-    found, k_B = start(record), starting_model([record]).values["k_B"]
-    assert found is not None
-    assert all({"m_P", "m_B"} <= set(c.told) for c in found.candidates)
+    result, k_B = start(record), starting_model([record]).values["k_B"]
+    assert result is not None
+    assert all({"m_P", "m_B"} <= set(c.told) for c in result.candidates)
     true = truth["m_B"] / truth["k_B"]
-    right = [c for c in found.candidates if abs(c.values["m_B"] / k_B / true - 1.0) < 0.01]
-    assert 0 < len(right) < len(found.candidates)
+    right = [c for c in result.candidates if abs(c.values["m_B"] / k_B / true - 1.0) < 0.01]
+    assert 0 < len(right) < len(result.candidates)
     damping = [c.values["c_B"] / k_B / (truth["c_B"] / truth["k_B"]) for c in right]
     assert damping == pytest.approx([1.0] * len(right), rel=0.05)
 
@@ -209,10 +210,10 @@ def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
     time = np.linspace(0.0, 5e-3, 100_000)
     voltage = np.where(time < 1e-4, 0.0, 200.0)
     record = noisy("long", time, voltage, simulated(values, time, voltage), 1e-3)
-    found = start(record)
-    assert errors(found, values, record)[0] < 0.06
-    assert found is not None
-    assert set(found.records) == {"long, fastest part", "long, coarse"}
+    result = start(record)
+    assert errors(result, values, record)[0] < 0.06
+    assert result is not None
+    assert set(result.records) == {"long, fastest part", "long, coarse"}
 
 
 @pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "structural_mode"]))
@@ -240,12 +241,12 @@ def test_a_zero_in_the_band_tells_the_stiffness_ratio(ratio: float) -> None:
         values |= {f"m_{part}": k / omega**2, f"c_{part}": 2.0 * damping * k / omega}
     time, voltage = step_voltage(values)
     record = noisy("step", time, voltage, simulated(values, time, voltage), 5e-4)
-    found = start(record)
-    assert found is not None
+    result = start(record)
+    assert result is not None
     k_B = starting_model([record]).values["k_B"]
-    told = [c.values["k_P"] / k_B for c in found.candidates if "k_P" in c.told]
-    assert told
-    assert min(abs(np.log(t / ratio)) for t in told) < 0.5
+    items = [c.values["k_P"] / k_B for c in result.candidates if "k_P" in c.told]
+    assert items
+    assert min(abs(np.log(t / ratio)) for t in items) < 0.5
 
 
 def random_stack(rng: np.random.Generator) -> dict[str, float]:

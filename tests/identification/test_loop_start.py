@@ -30,10 +30,10 @@ def errors(name: str, records: list[Record]) -> dict[str, float]:
     """Return errors of what the loops show: k, A and the bends over k + A, n as it is."""
     p = truth(name)
     model = starting_model(records, p["k_B"])
-    found = loop_start(model, records)
-    assert found is not None
+    values = loop_start(model, records)
+    assert values is not None
     size = static_compliance(p) * p["h_ref"]
-    true, value = quantities(p, size), quantities({**model.values, **found}, size)
+    true, value = quantities(p, size), quantities({**model.values, **values}, size)
     over = true["k_L"] + true["A"]
     shares = {n: (value[n] - true[n]) / over for n in ("k_L", "A", *BENDS)}
     return {**shares, "n": value["n"] - true["n"]}
@@ -41,8 +41,8 @@ def errors(name: str, records: list[Record]) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], STACKS))
 def test_loops_with_noise_tell_the_hysteresis(name: str) -> None:
-    found = errors(name, with_noise(loops(name), 1e-3, seed=2))
-    assert all(abs(e) < 0.03 for e in found.values()), found
+    result = errors(name, with_noise(loops(name), 1e-3, seed=2))
+    assert all(abs(e) < 0.03 for e in result.values()), result
 
 
 def test_noise_of_one_per_cent_and_missing_samples_still_leave_a_good_start() -> None:
@@ -52,16 +52,16 @@ def test_noise_of_one_per_cent_and_missing_samples_still_leave_a_good_start() ->
         y = np.array(r.displacement)
         y[200:230] = np.nan
         spoiled.append(replace(r, displacement=y))
-    found = errors("P-885.51", spoiled)
-    assert all(abs(e) < 0.3 for e in found.values()), found
-    assert abs(found["k_L"] + found["A"]) < 0.03
+    result = errors("P-885.51", spoiled)
+    assert all(abs(e) < 0.3 for e in result.values()), result
+    assert abs(result["k_L"] + result["A"]) < 0.03
 
 
 @slow
 def test_loops_that_begin_amid_a_period_tell_it_too() -> None:
     cut = [replace_from(r, 300) for r in with_noise(loops("PTBS200"), 1e-3, seed=1)]
-    found = errors("PTBS200", cut)
-    assert all(abs(e) < 0.1 for e in found.values()), found
+    result = errors("PTBS200", cut)
+    assert all(abs(e) < 0.1 for e in result.values()), result
 
 
 def replace_from(r: Record, first: int) -> Record:

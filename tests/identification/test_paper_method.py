@@ -51,8 +51,8 @@ def test_exact_limits_give_exact_coefficients(name: str) -> None:
     """With 1 - g = -sum r_i e^(p_i t), the limits are K_m = (-1)^(m+1) sum r_i / p_i^m."""
     p = values(name)
     limits = [(-1) ** (m + 1) * np.sum(residues(p) / poles(p) ** m).real for m in range(1, 7)]
-    found = coefficients_of_limits(np.array(limits))
-    np.testing.assert_allclose(found, coefficients_of_values(p), rtol=1e-3)
+    result = coefficients_of_limits(np.array(limits))
+    np.testing.assert_allclose(result, coefficients_of_values(p), rtol=1e-3)
 
 
 def test_moments_without_noise_and_with_a_little() -> None:
@@ -65,8 +65,8 @@ def test_moments_without_noise_and_with_a_little() -> None:
 
     def errors(p: dict[str, float], noise: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         white = noise * np.random.default_rng(0).standard_normal(time.size)
-        found = moment_coefficients(time, step_response(p, time) + white)
-        return np.asarray(np.abs(found / coefficients_of_values(p) - 1.0))
+        result = moment_coefficients(time, step_response(p, time) + white)
+        return np.asarray(np.abs(result / coefficients_of_values(p) - 1.0))
 
     quiet = errors(over, 0.0)
     assert np.all(quiet[:3] < 0.02)
@@ -81,19 +81,19 @@ def test_factors_reproduce_the_coefficients(name: str) -> None:
     p = values(name)
     exact = coefficients_of_values(p)
     named = dict(zip(COEFFICIENTS, exact.tolist(), strict=True))
-    found, notes = mechanics_of(named, p["k_P"], p["k_B"])
+    result, notes = mechanics_of(named, p["k_P"], p["k_B"])
     assert notes == ()
-    np.testing.assert_allclose(coefficients_of_values({**p, **found}), exact, rtol=1e-6)
+    np.testing.assert_allclose(coefficients_of_values({**p, **result}), exact, rtol=1e-6)
     for key in ("tau", "m_P", "c_P", "m_B", "c_B") if name == "PTBS200" else ("tau",):
-        assert found[key] == pytest.approx(p[key], rel=1e-4)
+        assert result[key] == pytest.approx(p[key], rel=1e-4)
 
 
 def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
     p = values("PTBS200")
     named = dict(zip(COEFFICIENTS, coefficients_of_values(p).tolist(), strict=True))
-    found, notes = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
+    result, notes = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
     assert "the poles allow" in str(notes[0])
-    assert found["tau"] == pytest.approx(p["tau"], rel=1e-4)
+    assert result["tau"] == pytest.approx(p["tau"], rel=1e-4)
 
 
 @pytest.mark.parametrize("leading", slow_but([False], [False, True]))
@@ -101,18 +101,18 @@ def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
     p = values(STACK)
     if leading:
         p |= {key: share * p["k_L"] for key, share in LEADING.items()}
-    found = hysteresis_part(find_loops([loop(leading=leading)]), p["k_L"] * compliance(p))
-    assert found.A is not None
-    assert found.delta is not None
-    assert found.bends is not None
-    n, beta, gamma = found.bends.n, found.bends.beta, found.bends.gamma
+    result = hysteresis_part(find_loops([loop(leading=leading)]), p["k_L"] * compliance(p))
+    assert result.A is not None
+    assert result.delta is not None
+    assert result.bends is not None
+    n, beta, gamma = result.bends.n, result.bends.beta, result.bends.gamma
     unit = compliance(p) ** (n - 1.0) * p["h_ref"] ** n
-    assert found.A / compliance(p) == pytest.approx(p["A"], rel=0.01)
-    assert found.delta / compliance(p) == pytest.approx(p["delta"], rel=0.15)
+    assert result.A / compliance(p) == pytest.approx(p["A"], rel=0.01)
+    assert result.delta / compliance(p) == pytest.approx(p["delta"], rel=0.15)
     assert n == pytest.approx(p["n"], rel=0.04)
     assert (beta + gamma) * unit == pytest.approx(p["beta"] + p["gamma"], rel=0.02)
     assert (gamma - beta) * unit == pytest.approx(p["gamma"] - p["beta"], rel=0.02)
-    assert [n.code for n in found.notes] == ["lagging_loop"] * (not leading)
+    assert [n.code for n in result.notes] == ["lagging_loop"] * (not leading)
 
 
 @slow
@@ -120,12 +120,12 @@ def test_the_whole_method_where_its_assumptions_hold() -> None:
     """A step without hysteresis and noise, long and dense; loops of the same stack."""
     p = values(STACK)
     records = [closed_step(values(STACK, **LINEAR), 8e-3, 40001), loop()]
-    found = paper_method(records, stiffness=p["k_B"])
-    assert found.coefficients is not None
+    paper_identification = paper_method(records, stiffness=p["k_B"])
+    assert paper_identification.coefficients is not None
     for name, exact in zip(COEFFICIENTS, coefficients_of_values(p), strict=True):
-        assert found.coefficients[name] == pytest.approx(exact, rel=0.15), name
-    assert found.k == pytest.approx(p["k_L"] * compliance(p), rel=1e-6)
-    model = found.model.values
+        assert paper_identification.coefficients[name] == pytest.approx(exact, rel=0.15), name
+    assert paper_identification.k == pytest.approx(p["k_L"] * compliance(p), rel=1e-6)
+    model = paper_identification.model.values
     assert model["k_B"] == p["k_B"]
     assert model["k_L"] == pytest.approx(p["k_L"], rel=1e-6)
     assert model["A"] == pytest.approx(p["A"], rel=0.01)
@@ -154,11 +154,11 @@ def test_steps_and_loops_are_told_by_their_voltage() -> None:
     records = [
         Record(name=n, time=time, voltage=v, displacement=1e-7 * v) for n, v in shapes.items()
     ]
-    found = {s.name: s for s in find_steps(records)}
-    assert list(found) == ["held", "ramped"]
-    assert found["held"].volts == 50.0
-    assert found["ramped"].k == pytest.approx(1e-7)
-    start = found["ramped"].time[-1] - (time[-1] - 0.51)
+    table = {s.name: s for s in find_steps(records)}
+    assert list(table) == ["held", "ramped"]
+    assert table["held"].volts == 50.0
+    assert table["ramped"].k == pytest.approx(1e-7)
+    start = table["ramped"].time[-1] - (time[-1] - 0.51)
     assert start == pytest.approx(0.0, abs=1e-6)
     loops = {a.name: a.frequency for a in find_loops(records)}
     assert loops == {"triangle": pytest.approx(2.0), "minor": pytest.approx(2.0)}
@@ -215,19 +215,36 @@ FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
 )
 def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
     make, expected = FAILURES[case]
-    found = paper_method(make())
-    assert any(expected in s for s in found.sentences), found.sentences
-    numbers = [*found.model.values.values(), *(found.coefficients or {}).values()]
+    paper_identification = paper_method(make())
+    assert any(expected in s for s in paper_identification.sentences), (
+        paper_identification.sentences
+    )
+    numbers = [
+        *paper_identification.model.values.values(),
+        *(paper_identification.coefficients or {}).values(),
+    ]
     assert np.all(np.isfinite(numbers))
-    assert all(s.endswith(".") for s in found.sentences)
+    assert all(s.endswith(".") for s in paper_identification.sentences)
 
 
 @slow
 def test_nothing_is_said_against_a_step_that_serves() -> None:
     assert linear_part(find_steps([_quiet(6e-3, 40001)])[0])[1] == []
-    found = paper_method([_quiet(6e-3, 40001), loop()])
-    assert not any("not to be trusted" in s or "no stack's" in s for s in found.sentences)
-    assert set(found.found) >= {"k_L", "A", "beta", "gamma", "delta", "n", "tau", "m_B", "c_B"}
+    paper_identification = paper_method([_quiet(6e-3, 40001), loop()])
+    assert not any(
+        "not to be trusted" in s or "no stack's" in s for s in paper_identification.sentences
+    )
+    assert set(paper_identification.found) >= {
+        "k_L",
+        "A",
+        "beta",
+        "gamma",
+        "delta",
+        "n",
+        "tau",
+        "m_B",
+        "c_B",
+    }
 
 
 def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,6 +254,6 @@ def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch
         "psa_casadi.identification.paper.paper_method",
         lambda records, stiffness: type(real)(**{**vars(real), "model": wild}),
     )
-    found = identify_by_paper([loop()])
-    assert "cannot be simulated on the records" in found.warnings[-1]
-    assert np.isfinite(found.fit.rms)
+    stack_identification = identify_by_paper([loop()])
+    assert "cannot be simulated on the records" in stack_identification.warnings[-1]
+    assert np.isfinite(stack_identification.fit.rms)

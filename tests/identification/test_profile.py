@@ -58,16 +58,16 @@ def fitted(*free: str, noise: float = SIGMA) -> tuple[Fit, list[Experiment]]:
 
 @pytest.mark.parametrize("name", ["k_L", "tau", "beta", "n"])
 def test_where_the_cost_is_quadratic_it_is_the_linearised_interval(name: str) -> None:
-    found, experiments = fitted("k_L", "A", "beta", "gamma", "n", "tau")
-    p = profile(found, experiments, name)
-    linear = determinacy(found, experiments).intervals[name]
+    result, experiments = fitted("k_L", "A", "beta", "gamma", "n", "tau")
+    p = profile(result, experiments, name)
+    linear = determinacy(result, experiments).intervals[name]
     assert p.low is not None
     assert p.high is not None
     assert p.high - p.low == pytest.approx(linear.high - linear.low, rel=0.1)
     assert 0.5 * (p.high + p.low) == pytest.approx(
         0.5 * (linear.high + linear.low), abs=0.05 * (linear.high - linear.low)
     )
-    assert p.estimate == found.model.values[name]
+    assert p.estimate == result.model.values[name]
     assert np.all(np.diff(p.values) > 0)
     assert p.increase.min() == 0.0
 
@@ -76,8 +76,8 @@ def test_residuals_above_the_weights_widen_it() -> None:
     """The weights say 2e-8 m, the residuals 6e-8 m: the interval is three times as wide."""
     widths = []
     for noise in (SIGMA, 3.0 * SIGMA):
-        found, experiments = fitted("k_L", "tau", noise=noise)
-        p = profile(found, experiments, "tau")
+        result, experiments = fitted("k_L", "tau", noise=noise)
+        p = profile(result, experiments, "tau")
         assert p.low is not None
         assert p.high is not None
         widths.append(p.high - p.low)
@@ -86,19 +86,19 @@ def test_residuals_above_the_weights_widen_it() -> None:
 
 def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
     """R_s C_p lies far below the sampling: an interval that no standard error describes."""
-    found, experiments = fitted("k_L", "tau", "R_s")
-    p = profile(found, experiments, "R_s")
+    result, experiments = fitted("k_L", "tau", "R_s")
+    p = profile(result, experiments, "R_s")
     assert p.high is not None
 
     def grown(value: float) -> float:
         held = fit(
-            found.model.with_values({"R_s": value}),
+            result.model.with_values({"R_s": value}),
             experiments,
             ("k_L", "tau"),
-            sigma=found.sigma,
-            start_states=[found.start(0)],
+            sigma=result.sigma,
+            start_states=[result.start(0)],
         )
-        return held.cost - found.cost
+        return held.cost - result.cost
 
     unit = grown(float(p.values[-1])) / p.increase[-1]
     assert grown(p.high) / unit == pytest.approx(PROFILE_LIMIT, rel=0.1)
@@ -113,8 +113,8 @@ def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
         q.name for q in EFFECTS["slow_creep"].parameters if q.name != EFFECTS["slow_creep"].gain
     )
     experiments = [whole(record_of(plant(), 1))]
-    found = fit(model, experiments, ("k_L", free), sigma=[SIGMA])
-    p = profile(found, experiments, free)
+    result = fit(model, experiments, ("k_L", free), sigma=[SIGMA])
+    p = profile(result, experiments, free)
     assert p.low is None
     assert p.high is None
     assert p.increase.max() < 0.1
@@ -124,8 +124,8 @@ def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
 
 
 def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
-    found, experiments = fitted("k_L", "tau", "c_P")
-    p = profile(found, experiments, "c_P")
+    result, experiments = fitted("k_L", "tau", "c_P")
+    p = profile(result, experiments, "c_P")
     assert p.low is None
     assert p.high is not None
     assert p.high > 1e3
@@ -137,14 +137,14 @@ def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
 
 
 def test_a_fit_that_stopped_short_is_told_so() -> None:
-    found, experiments = fitted("k_L", "tau")
-    theta = found.theta.copy()
-    error = determinacy(found, experiments).standard_errors["tau"]
-    moved = found.model.values["tau"] + 1.5 * error
-    theta[:2] = found.unknowns.coordinates({**found.model.values, "tau": moved})
-    short = replace(found, theta=theta, model=found.model.with_values({"tau": moved}))
+    result, experiments = fitted("k_L", "tau")
+    theta = result.theta.copy()
+    error = determinacy(result, experiments).standard_errors["tau"]
+    moved = result.model.values["tau"] + 1.5 * error
+    theta[:2] = result.unknowns.coordinates({**result.model.values, "tau": moved})
+    short = replace(result, theta=theta, model=result.model.with_values({"tau": moved}))
     p = profile(short, experiments, "tau")
-    complete = profile(found, experiments, "tau")
+    complete = profile(result, experiments, "tau")
     assert len(profile_sentences(complete)) == 1
     assert "had not reached its minimum" in profile_sentences(p)[1]
     assert p.low == pytest.approx(complete.low, rel=2e-3)
@@ -152,14 +152,14 @@ def test_a_fit_that_stopped_short_is_told_so() -> None:
 
 
 def test_a_parameter_that_was_not_searched_has_no_profile() -> None:
-    found, experiments = fitted("k_L", "tau")
+    result, experiments = fitted("k_L", "tau")
     with pytest.raises(InputError, match=r"'m_P' was not searched in this fit.*k_L, tau"):
-        profile(found, experiments, "m_P")
+        profile(result, experiments, "m_P")
 
 
 def test_sentence_and_plot_show_profile_limit_and_interval() -> None:
-    found, experiments = fitted("k_L", "tau")
-    closed = profile(found, experiments, "tau")
+    result, experiments = fitted("k_L", "tau")
+    closed = profile(result, experiments, "tau")
     (sentence,) = profile_sentences(closed)
     assert sentence.startswith("tau lies between 2.")
     assert sentence.endswith("ms.")

@@ -41,10 +41,10 @@ def _record(*, smooth: bool) -> tuple[Fit, tuple[Experiment, ...]]:
 
 
 def test_a_smooth_voltage_is_seen_and_straight_lines_get_the_mean_of_its_curve() -> None:
-    found, experiments = _record(smooth=True)
-    seen = smooth_between(found, experiments)
-    assert seen is not None
-    (moved,), note = seen
+    result, experiments = _record(smooth=True)
+    otherwise = smooth_between(result, experiments)
+    assert otherwise is not None
+    (moved,), note = otherwise
     assert note.code == "smooth_voltage"
     assert note.values["share"] == pytest.approx(1.0, abs=0.25)
     voltage, before = moved.record.voltage, experiments[0].record.voltage
@@ -53,16 +53,16 @@ def test_a_smooth_voltage_is_seen_and_straight_lines_get_the_mean_of_its_curve()
     phase_rate = 2.0 * np.pi * (5.0 + 115.0 * moved.record.time[last])
     larger = (before[last] - 50.0) * (phase_rate * STEP) ** 2 / 12.0
     np.testing.assert_allclose((voltage - before)[last][5:-5], larger[5:-5], atol=0.01)
-    again = fit(found.model, (moved,), found.unknowns.names, sigma=[NOISE])
-    assert again.rms < 1.02 * NOISE < found.rms
+    again = fit(result.model, (moved,), result.unknowns.names, sigma=[NOISE])
+    assert again.rms < 1.02 * NOISE < result.rms
     assert smooth_between(again, (moved,)) is None
 
 
 def test_straight_lines_and_other_errors_are_left_as_they_are() -> None:
-    found, experiments = _record(smooth=False)
-    assert smooth_between(found, experiments) is None
+    result, experiments = _record(smooth=False)
+    assert smooth_between(result, experiments) is None
     time = experiments[0].record.time
-    other = replace(found, residuals=found.residuals + 5e-8 * np.sin(700.0 * time))
+    other = replace(result, residuals=result.residuals + 5e-8 * np.sin(700.0 * time))
     assert smooth_between(other, experiments) is None
 
 
@@ -78,17 +78,17 @@ def test_stamps_that_jitter_are_told_from_samples_that_do(stamps: bool) -> None:
     fine = np.sort(np.concatenate([taken, np.linspace(0.0, taken[-1], 4 * COUNT)[1:-1]]))
     model = stack_model("demo")
     x = simulate(model, fine, np.interp(fine, taken, _chirp(taken))).displacement
-    shown = np.interp(taken, fine, x) + NOISE * random.standard_normal(COUNT)
-    record = Record(name="r", time=late, voltage=_chirp(taken), displacement=shown)
-    found = fit(model, (whole(record),), FREE[:4], sigma=[NOISE])
-    seen = even_clock(found, (whole(record),))
-    assert (seen is not None) == stamps
-    if seen is not None:
-        (moved,), note = seen
+    displayed = np.interp(taken, fine, x) + NOISE * random.standard_normal(COUNT)
+    record = Record(name="r", time=late, voltage=_chirp(taken), displacement=displayed)
+    result = fit(model, (whole(record),), FREE[:4], sigma=[NOISE])
+    otherwise = even_clock(result, (whole(record),))
+    assert (otherwise is not None) == stamps
+    if otherwise is not None:
+        (moved,), note = otherwise
         assert note.values["rms"] == pytest.approx(0.1 * STEP, rel=0.05)
         np.testing.assert_allclose(moved.record.time, even, atol=0.01 * STEP)
-        again = fit(found.model, (moved,), FREE[:4], sigma=[NOISE])
-        assert again.rms < 1.05 * NOISE < 0.5 * found.rms
+        again = fit(result.model, (moved,), FREE[:4], sigma=[NOISE])
+        assert again.rms < 1.05 * NOISE < 0.5 * result.rms
         assert even_clock(again, (moved,)) is None
 
 
@@ -120,5 +120,5 @@ def _rings(x: FloatArray, step: float) -> FloatArray:
     z = np.exp(pole * step)
     lower = [1.0, -2.0 * z.real, abs(z) ** 2]
     weights = np.array([1.0, 4.0, 1.0]) / 6.0  # straight lines between the fine samples
-    found: FloatArray = lfilter(sum(lower) * weights, lower, x)
-    return found
+    values: FloatArray = lfilter(sum(lower) * weights, lower, x)
+    return values

@@ -32,12 +32,12 @@ def test_a_stack_is_found_from_its_records_alone() -> None:
     assert run.converged
     assert run.rms_ratio == pytest.approx(1.0, abs=0.05)
     assert all(run.white)
-    told = {f.name: f for f in run.found if f.determined}
-    assert {"k_L", "A", "beta", "gamma", "delta", "n"} <= set(told)
+    table = {f.name: f for f in run.found if f.determined}
+    assert {"k_L", "A", "beta", "gamma", "delta", "n"} <= set(table)
     for name_of, limit in {"k_L": 0.01, "A": 0.01, "n": 0.05, "beta": 0.05}.items():
-        assert told[name_of].relative < limit, name_of
-    assert sum(not f.covered for f in told.values()) <= 2
-    assert all(abs(f.value - f.truth) < 4.5 * f.error for f in told.values())
+        assert table[name_of].relative < limit, name_of
+    assert sum(not f.covered for f in table.values()) <= 2
+    assert all(abs(f.value - f.truth) < 4.5 * f.error for f in table.values())
 
 
 def test_exchanging_twice_changes_nothing() -> None:
@@ -69,10 +69,12 @@ def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, oth
     p = truth("demo")
     p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
     slow, what = {**p, "tau": 1e-3 * 3e8 / 3.5e8}, {"P": "wafers", "B": "bonding layers"}[part]
-    found = dict(exchanges(slow))[f"creep lag for the slow pole of the {what}"]
-    moved = {**slow, **found}
-    seen, f = _response(slow, np.zeros(1))[0], np.geomspace(1.0, 2e3, 50)
-    np.testing.assert_allclose(_response(moved, f), _response(slow, f), rtol=0, atol=0.02 * seen)
+    result = dict(exchanges(slow))[f"creep lag for the slow pole of the {what}"]
+    moved = {**slow, **result}
+    observed, f = _response(slow, np.zeros(1))[0], np.geomspace(1.0, 2e3, 50)
+    np.testing.assert_allclose(
+        _response(moved, f), _response(slow, f), rtol=0, atol=0.02 * observed
+    )
     assert moved["tau"] == pytest.approx(1e-3)
     apart = {**slow, "tau": 1.2 * slow["tau"]}
     assert not [w for w, _ in exchanges(apart) if "slow pole" in w]
@@ -90,13 +92,13 @@ def found() -> StackIdentification:
 
 def test_every_record_has_its_own_noise_level() -> None:
     quiet, loud = with_noise(loops()[:1], 2e-3, 1)[0], loops()[1]
-    found = identify([quiet, loud])
+    result = identify([quiet, loud])
     first, second = (
-        float(np.std(found.fit.residuals[found.fit.of_record(found.experiments, r)]))
+        float(np.std(result.fit.residuals[result.fit.of_record(result.experiments, r)]))
         for r in (0, 1)
     )
     assert first > 1.5 * second
-    assert found.fit.sigma == pytest.approx((first, second), rel=0.1)
+    assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
 def test_what_loops_leave_open_is_told_in_words(found: StackIdentification) -> None:
@@ -125,12 +127,12 @@ def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(fitting, "Objective", interrupted)
     begin = time.perf_counter()
-    found = identify(loops()[:1])
+    result = identify(loops()[:1])
     assert count[0] == 8  # nothing was evaluated after the interrupt
-    assert found.fit.interrupted
-    assert not found.fit.converged
-    assert found.warnings[0].startswith("The search was interrupted")
-    assert found.fit.rms < 0.2 * loops()[0].range_m
+    assert result.fit.interrupted
+    assert not result.fit.converged
+    assert result.warnings[0].startswith("The search was interrupted")
+    assert result.fit.rms < 0.2 * loops()[0].range_m
     assert time.perf_counter() - begin < 60.0
     assert threading.active_count() < 20
 

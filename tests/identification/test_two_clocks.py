@@ -34,8 +34,8 @@ def run() -> Run:
 
 def record(run: Run, displacement: FloatArray, noise: float = 0.0, seed: int = 5) -> Record:
     """Return a record with white noise, in m."""
-    shown = displacement + noise * np.random.default_rng(seed).standard_normal(SAMPLES)
-    return Record(name="r", time=run.times, voltage=run.command, displacement=shown)
+    displayed = displacement + noise * np.random.default_rng(seed).standard_normal(SAMPLES)
+    return Record(name="r", time=run.times, voltage=run.command, displacement=displayed)
 
 
 def two_clocked(run: Run, beats: float) -> tuple[FloatArray, FloatArray]:
@@ -50,37 +50,37 @@ def two_clocked(run: Run, beats: float) -> tuple[FloatArray, FloatArray]:
 def test_the_saw_tooth_is_found_and_undone(run: Run, beats: float) -> None:
     """Period within 1 %, height within 10 %, under noise twice the saw tooth."""
     reading, even = two_clocked(run, beats)
-    given = record(run, reading, 2.0 * float(np.std(even)))
-    found = two_clocks(given)
-    assert found is not None
-    assert found.period == pytest.approx(STEP * SAMPLES / abs(beats), rel=0.01)
-    assert found.height == pytest.approx(STEP / RENEWALS, rel=0.1)
-    assert found.falling == (beats < 0)
-    assert np.std(found.moved - even) < 0.25 * np.std(even)
-    there = found.undone(given)
+    inputs = record(run, reading, 2.0 * float(np.std(even)))
+    result = two_clocks(inputs)
+    assert result is not None
+    assert result.period == pytest.approx(STEP * SAMPLES / abs(beats), rel=0.01)
+    assert result.height == pytest.approx(STEP / RENEWALS, rel=0.1)
+    assert result.falling == (beats < 0)
+    assert np.std(result.moved - even) < 0.25 * np.std(even)
+    there = result.undone(inputs)
     assert two_clocks(there) is None
-    assert there.sha256 != given.sha256
+    assert there.sha256 != inputs.sha256
 
 
 def test_the_finding_is_told_and_repeats(run: Run) -> None:
     """In the sentences of a fit; the same within 1 % when the data change by 1 % of their noise."""
     reading, even = two_clocked(run, -3.3)
     noise = 2.0 * float(np.std(even))
-    given = record(run, reading, noise)
-    found, gaps = two_clocks(given), np.asarray(given.displacement).copy()
-    assert found is not None
-    again = two_clocks(record(run, np.asarray(given.displacement), 0.01 * noise, seed=6))
+    inputs = record(run, reading, noise)
+    result, gaps = two_clocks(inputs), np.asarray(inputs.displacement).copy()
+    assert result is not None
+    again = two_clocks(record(run, np.asarray(inputs.displacement), 0.01 * noise, seed=6))
     assert again is not None
-    assert again.period == pytest.approx(found.period, rel=0.01)
-    assert again.height == pytest.approx(found.height, rel=0.01)
-    ready, said = prepared(given)
-    assert any("sampled by two clocks" in s for s in texts(said))
+    assert again.period == pytest.approx(result.period, rel=0.01)
+    assert again.height == pytest.approx(result.height, rel=0.01)
+    ready, statement = prepared(inputs)
+    assert any("sampled by two clocks" in s for s in texts(statement))
     assert two_clocks(ready) is None
-    assert (ready.name, ready.sha256) == (given.name, given.sha256)
+    assert (ready.name, ready.sha256) == (inputs.name, inputs.sha256)
     gaps[100:110] = np.nan
-    with_gaps = two_clocks(replace(given, displacement=gaps))
+    with_gaps = two_clocks(replace(inputs, displacement=gaps))
     assert with_gaps is not None
-    assert with_gaps.period == pytest.approx(found.period, rel=0.01)
+    assert with_gaps.period == pytest.approx(result.period, rel=0.01)
     assert np.isnan(with_gaps.moved[100:110]).all()
 
 
@@ -90,12 +90,12 @@ def test_the_measured_sine_has_two_clocks(measured_data: Path) -> None:
         read_record(measured_data / "micromanipulator" / f"{name}.csv")
         for name in ("sine_1hz", "minor_loops")
     )
-    found = two_clocks(sine)
-    assert found is not None
-    told = found.sentence(sine).split(": ", 1)[1].split(". ")[0]
+    result = two_clocks(sine)
+    assert result is not None
+    output = result.sentence(sine).split(": ", 1)[1].split(". ")[0]
     page = (Path(__file__).parents[2] / "docs" / "measured.md").read_text(encoding="utf-8")
-    said = " ".join(page.split())
-    assert told.split(": ")[1] in said
+    text = " ".join(page.split())
+    assert output.split(": ")[1] in text
     assert two_clocks(loops) is None
 
 

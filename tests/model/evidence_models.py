@@ -20,9 +20,11 @@ def noisy_record() -> psa.Record:
     """Return 640 samples in 0.64 s: 0 to 80 V, with drawn noise and an offset of the sensor."""
     time = np.asarray(np.arange(640) * 1e-3, dtype=np.float64)
     voltage = 40.0 * (1.0 - np.cos(25.0 * time)) * (1.0 - 0.5 * time)
-    found = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
+    result = psa.simulate(psa.stack_model("demo"), time, voltage).displacement
     noise = NOISE * np.random.default_rng(3).standard_normal(len(time))
-    return psa.Record(name="short", time=time, voltage=voltage, displacement=found + noise + OFFSET)
+    return psa.Record(
+        name="short", time=time, voltage=voltage, displacement=result + noise + OFFSET
+    )
 
 
 @cache
@@ -31,9 +33,9 @@ def evident_model() -> psa.Model:
     record = noisy_record()
     experiments = divided([record], ())
     start = psa.stack_model("demo")
-    begun = {n: 1.05 * start.values[n] for n in ("k_L", "A", "tau")}
-    found = fit(start, experiments, list(begun), sigma=[NOISE], start=begun)
-    return diagnosed_model(found, experiments, found.predicted(experiments), False)
+    table = {n: 1.05 * start.values[n] for n in ("k_L", "A", "tau")}
+    result = fit(start, experiments, list(table), sigma=[NOISE], start=table)
+    return diagnosed_model(result, experiments, result.predicted(experiments), False)
 
 
 @cache

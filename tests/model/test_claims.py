@@ -88,10 +88,10 @@ def drive(
 
 def inputs_of(model: psa.Model, t: FloatArray, voltage: FloatArray, load: FloatArray) -> FloatArray:
     """Return the samples of all inputs; a temperature climbs by three kelvin from its reference."""
-    given = {"voltage": voltage, "load_force": load}
+    table = {"voltage": voltage, "load_force": load}
     if "temperature" in model.input_names:
-        given["temperature"] = model.values["temperature_reference"] + 3.0 * t / t[-1]
-    return input_samples(model, len(t), given)
+        table["temperature"] = model.values["temperature_reference"] + 3.0 * t / t[-1]
+    return input_samples(model, len(t), table)
 
 
 def start_of(effect: psa.Component, model: psa.Model) -> FloatArray:
@@ -131,8 +131,8 @@ def test_a_gain_changes_what_is_measured(effect: psa.Component) -> None:
     voltage = 50.0 * (1.0 - np.cos(2 * np.pi * t)) + 20.0 * (t > 0.7)
     u = inputs_of(model, t, voltage, np.zeros_like(t))
     start = start_of(effect, model)
-    shown = [psa.run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
-    assert np.abs(shown[1] - shown[0]).max() > 1e-4 * np.ptp(shown[0])
+    items = [psa.run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
+    assert np.abs(items[1] - items[0]).max() > 1e-4 * np.ptp(items[0])
 
 
 @every_effect
@@ -183,10 +183,10 @@ def test_variables_have_units_bounds_and_sizes(component: psa.Component) -> None
     assert all(0.0 < sizes[s.name] < 1e6 for s in component.states)
     held = [nominal_value(s.nominal, model.values) for s in component.sampled]
     assert all(0.0 < size < 1e6 for size in held)
-    shown: list[psa.Input | psa.Output] = [*component.inputs, *component.outputs]
-    assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in shown)
+    displayed: list[psa.Input | psa.Output] = [*component.inputs, *component.outputs]
+    assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in displayed)
     variables: list[psa.Parameter | psa.State | psa.Input | psa.Output] = [*component.parameters]
-    variables += [*component.states, *component.sampled, *shown]
+    variables += [*component.states, *component.sampled, *displayed]
     for variable in variables:
         assert len(variable.description) > 3
         unit = variable.display_unit or variable.unit
@@ -207,8 +207,8 @@ def test_c_value_is_the_casadi_value(effects: tuple[psa.Component, ...]) -> None
             expected = plain.get(name) or function.call(at)
             wanted = [np.array(e).ravel(order="F") for e in expected]
             sizes = [w.size for w in wanted]
-            found = c_values(model, name.removeprefix("psa_"), point, sizes)
-            for ours, theirs in zip(found, wanted, strict=True):
+            arrays = c_values(model, name.removeprefix("psa_"), point, sizes)
+            for ours, theirs in zip(arrays, wanted, strict=True):
                 np.testing.assert_allclose(ours, theirs, rtol=1e-13, atol=0, err_msg=name)
 
 
@@ -230,9 +230,9 @@ def test_sensitivities_are_differences_of_runs(effect: psa.Component) -> None:
         step = share * model.parameter(name).typical(model.values)
         moved = [{**model.values, name: model.values[name] + h} for h in (step, -step)]
         ends = [psa.run(model, t, u, start, rtol=rtol, values=values).y for values in moved]
-        found = (ends[0][:, -1] - ends[1][:, -1]) / (2 * step)
+        result = (ends[0][:, -1] - ends[1][:, -1]) / (2 * step)
         size = np.abs(exact[:, column]).max()
         assert size > 0.0, name
         np.testing.assert_allclose(
-            found, exact[:, column], rtol=0, atol=allowed * size, err_msg=name
+            result, exact[:, column], rtol=0, atol=allowed * size, err_msg=name
         )

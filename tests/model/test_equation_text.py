@@ -58,8 +58,8 @@ def test_an_expression_is_written_as_people_write_it(built: Any, text: str) -> N
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_function_reads_back_as_itself(name: str) -> None:
-    given = [X, Y, ca.SX(0.7)][: FUNCTIONS[name]]
-    built = getattr(ca, name)(*given)
+    inputs = [X, Y, ca.SX(0.7)][: FUNCTIONS[name]]
+    built = getattr(ca, name)(*inputs)
     again = equations_of(texts_of(kept(built)), "own.a.equations")
     for x, y in np.random.default_rng(1).uniform(-3.0, 3.0, (20, 2)):
         np.testing.assert_equal(value(again, x, y), value(kept(built), x, y))
@@ -154,10 +154,10 @@ HOSTILE = {
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_hostile_text_is_refused_at_once(case: str) -> None:
     began = time.thread_time()
-    with pytest.raises(psa.InputError, match=r"'own\.a\.equations\.der\.x' ") as told:
+    with pytest.raises(psa.InputError, match=r"'own\.a\.equations\.der\.x' ") as output:
         read(HOSTILE[case])
     assert time.thread_time() - began < 1.0
-    assert all(len(p) < 700 for p in told.value.problems)
+    assert all(len(p) < 700 for p in output.value.problems)
 
 
 def test_parts_cannot_grow_beyond_what_is_written() -> None:

@@ -23,16 +23,16 @@ MODEL = psa.stack_model("demo")
 
 def _short() -> Evidence | None:
     """Return evidence whose reference run has three samples, one of them not measured."""
-    told = evident_model().evidence
-    if told is None or told.reference is None:
-        return told
+    evidence = evident_model().evidence
+    if evidence is None or evidence.reference is None:
+        return evidence
     reference = replace(
-        told.reference,
-        time=told.reference.time[:3],
-        inputs={n: c[:3] for n, c in told.reference.inputs.items()},
-        displacement=(None, *told.reference.displacement[1:3]),
+        evidence.reference,
+        time=evidence.reference.time[:3],
+        inputs={n: c[:3] for n, c in evidence.reference.inputs.items()},
+        displacement=(None, *evidence.reference.displacement[1:3]),
     )
-    return replace(told, reference=reference)
+    return replace(evidence, reference=reference)
 
 
 SAVED = replace(
@@ -57,10 +57,10 @@ PIECES = ("1e999", "NaN", "-Infinity", "9" * 5000, "[" * 3000, r'"\u0000"', '{"a
 
 def same_or_refused(text: str) -> bool:
     """Whether a text is refused as it should be; what is not must come back from a new file."""
-    said = sentences(lambda: loads(text, "m.json"))
-    if said:
-        assert len(said) <= 21
-        assert all(p.startswith(("m.json", "... and")) and len(p) < 2000 for p in said)
+    texts = sentences(lambda: loads(text, "m.json"))
+    if texts:
+        assert len(texts) <= 21
+        assert all(p.startswith(("m.json", "... and")) and len(p) < 2000 for p in texts)
         return True
     model = loads(text)
     written = dumps(model)
@@ -74,8 +74,8 @@ def same_or_refused(text: str) -> bool:
 
 
 def test_a_whole_file_comes_back() -> None:
-    said = psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
-    text = dumps(replace(SAVED, publication=said))
+    publication = psa.Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+    text = dumps(replace(SAVED, publication=publication))
     assert dumps(loads(text)) == text
 
 
@@ -117,9 +117,9 @@ def edited(change: Callable[[dict[str, Any]], object]) -> str:
 
 def refused(change: Callable[[dict[str, Any]], object]) -> str:
     """Return what is said of a changed file, each sentence of which begins with its name."""
-    said = sentences(lambda: loads(edited(change), "m.json"))
-    assert all(line.startswith("m.json") for line in said)
-    return "\n".join(said)
+    texts = sentences(lambda: loads(edited(change), "m.json"))
+    assert all(line.startswith("m.json") for line in texts)
+    return "\n".join(texts)
 
 
 GONE = object()

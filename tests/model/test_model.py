@@ -37,8 +37,8 @@ def test_a_loop_of_balances_is_named() -> None:
     loop_names = text.split(":")[1].split(";")[0].strip().split(" -> ")
     assert loop_names[0] == loop_names[-1]
     assert set(loop_names) == {"drive_voltage", "drive_current", "stack_current"}
-    own = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
-    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, own)))
+    item = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
+    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, item)))
 
 
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
@@ -98,17 +98,17 @@ def evidence_in(model: psa.Model) -> Evidence:
 
 
 def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
-    record, told = noisy_record(), evidence_in(evident_model())
+    record, output = noisy_record(), evidence_in(evident_model())
     rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
-    assert told.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
-    assert told.seen.rate == pytest.approx(rates.max())
-    assert told.seen.duration == record.duration
-    assert told.seen.temperature is None
-    held = told.held_out
+    assert output.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert output.seen.rate == pytest.approx(rates.max())
+    assert output.seen.duration == record.duration
+    assert output.seen.temperature is None
+    held = output.held_out
     assert held is not None
     assert held.interval_m.low < NOISE < held.interval_m.high
     assert held.rms_m == pytest.approx(NOISE, rel=0.15)
-    (played,) = told.runs
+    (played,) = output.runs
     assert (played.sha256, played.samples, played.averaged) == (record.sha256, 640, 1)
     assert played.offset_m == pytest.approx(OFFSET, abs=1e-8)
     (split,) = divided([record], ())
@@ -118,11 +118,11 @@ def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
 
 def test_the_covariance_is_that_of_the_intervals() -> None:
     model = evident_model()
-    told, known = evidence_in(model).covariance, model.provenance.intervals
-    assert told.names == ("k_L", "A", "tau")
-    for k, name in enumerate(told.names):
+    output, known = evidence_in(model).covariance, model.provenance.intervals
+    assert output.names == ("k_L", "A", "tau")
+    for k, name in enumerate(output.names):
         half = 0.5 * (known[name].high - known[name].low)
-        assert 1.96 * told.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
+        assert 1.96 * output.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
 
 
 def test_other_values_or_physics_have_no_evidence() -> None:
@@ -139,11 +139,12 @@ def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
     model = evident_model()
     drift = psa.EFFECTS["offset_drift"]
     gain = drift.gain or ""
-    told = evidence_in(model)
+    evidence = evidence_in(model)
     names = ("k_L", gain)
-    wider = replace(told.covariance, names=names, matrix=((4.0, 1.0), (1.0, 9.0)))
+    wider = replace(evidence.covariance, names=names, matrix=((4.0, 1.0), (1.0, 9.0)))
     both = replace(
-        model.with_effect(drift), evidence=replace(told, covariance=wider, outside=(drift.name,))
+        model.with_effect(drift),
+        evidence=replace(evidence, covariance=wider, outside=(drift.name,)),
     )
     plant = loads(dumps(both)).plant()
     assert evidence_in(plant).covariance.names == ("k_L",)

@@ -28,20 +28,20 @@ SPAN, MU = 10.0, 3.0
 
 def _oscillation(times: Any) -> Any:
     """Return the position (n,) of the oscillator with mu = MU, by scipy and by hand."""
-    found = solve_ivp(
+    result = solve_ivp(
         lambda _, z: [z[1], MU * (1.0 - z[0] ** 2) * z[1] - z[0]],
         (0.0, SPAN), [2.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-12, t_eval=times,
     )  # fmt: skip
-    assert found.success
-    return found.y[0]
+    assert result.success
+    return result.y[0]
 
 
 def test_the_oscillator_runs_in_a_modelica_compiler() -> None:
     text = modelica_text(van_der_pol().with_values({"mu": MU}), name="VanDerPol")
     harness = "model Harness VanDerPol.Signal device; end Harness;"
-    found = simulated(text + harness, "Harness", SPAN)
-    expected = _oscillation(found["time"])
-    assert found["device.position"] == pytest.approx(expected, abs=1e-6)
+    result = simulated(text + harness, "Harness", SPAN)
+    expected = _oscillation(result["time"])
+    assert result["device.position"] == pytest.approx(expected, abs=1e-6)
     assert load(text, "VanDerPol.Examples.Free") is not None
 
 
@@ -80,16 +80,16 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
     )  # fmt: skip
     room = 3.0 * np.sin(2 * math.pi * expected.t / 60.0)
     above, product = expected.y[0] - room, 2.0 * expected.y[0]
-    own = psa.run(model, expected.t, np.full((61, 1), 2.0), np.array([1.0, 0.0]), rtol=1e-10)
-    assert own.y == pytest.approx(np.column_stack([above, product]), abs=1e-7)
+    item = psa.run(model, expected.t, np.full((61, 1), 2.0), np.array([1.0, 0.0]), rtol=1e-10)
+    assert item.y == pytest.approx(np.column_stack([above, product]), abs=1e-7)
     fmu = psa.export_fmu(model, tmp_path / "rod.fmu")
     ends = np.array([(0.0, 2.0), (30.0, 2.0)], dtype=[("time", float), ("current", float)])
-    found = simulate_fmu(
+    result = simulate_fmu(
         str(fmu), fmi_type="CoSimulation", stop_time=30.0, output_interval=0.5, input=ends,
         relative_tolerance=1e-9, output=["above_room", "heat"],
     )  # fmt: skip
-    assert found["above_room"] == pytest.approx(above, abs=1e-6)
-    assert found["heat"] == pytest.approx(product, abs=1e-6)
+    assert result["above_room"] == pytest.approx(above, abs=1e-6)
+    assert result["heat"] == pytest.approx(product, abs=1e-6)
     described = {v.name: v for v in read_model_description(str(fmu)).modelVariables}
     assert (described["current"].unit, described["heat"].unit) == ("A", "A.K")
     assert (described["T"].start, described["lag"].start) == ("1.0", "4.0")
@@ -98,8 +98,8 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
 def test_a_function_of_casadi_is_an_ode_too() -> None:
     x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
     rates = ca.vertcat(x[1], u - k * x[0])
-    given = ca.Function("given", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
-    model = psa.ode_model(given, name="spring", parameters=["k"], values={"k": 4.0})
+    function = ca.Function("given", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
+    model = psa.ode_model(function, name="spring", parameters=["k"], values={"k": 4.0})
     assert model.state_names == ("x_0", "x_1")
     assert model.output_names == ("x_0_out", "x_1_out")
     assert model.input_names == ("u",)
@@ -113,8 +113,8 @@ def test_a_kink_that_is_named_is_met_with_care_and_is_an_event_of_the_fmu() -> N
     x, t = ca.SX.sym("x"), ca.SX.sym("t")
     ode = {"t": t, "x": x, "ode": ca.fabs(ca.sin(3.0 * t))}
     blind, aware = (
-        psa.ode_model(given, name=name)
-        for given, name in ((ode, "blind"), ({**ode, "zero": ca.sin(3.0 * t)}, "aware"))
+        psa.ode_model(inputs, name=name)
+        for inputs, name in ((ode, "blind"), ({**ode, "zero": ca.sin(3.0 * t)}, "aware"))
     )
     turns = int(9.0 / math.pi)
     expected = (2.0 * turns + 1.0 - math.cos(9.0 - turns * math.pi)) / 3.0
@@ -154,8 +154,8 @@ def test_algebraic_equations_are_solved_beside_intermediates() -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
         at = 0.0, rng.normal(), rng.normal(), rng.uniform(1e2, 1e4)
-        found, expected = (_bridge(whole=q).structure.f(*at)[0] for q in (False, True))
-        assert float(found) == pytest.approx(float(expected), rel=1e-12)
+        result, expected = (_bridge(whole=q).structure.f(*at)[0] for q in (False, True))
+        assert float(result) == pytest.approx(float(expected), rel=1e-12)
 
 
 def test_a_table_is_the_spline_in_a_file_in_c_and_beyond_its_ends(tmp_path: Path) -> None:
@@ -176,8 +176,8 @@ def test_a_table_is_the_spline_in_a_file_in_c_and_beyond_its_ends(tmp_path: Path
             psa.run(m, t, np.zeros((61, 0)), np.array([-2.0])).y[:, 0], expected, atol=1e-9
         )
     psa.export_fmu(model, tmp_path / "m.fmu")
-    shown = simulate_fmu(str(tmp_path / "m.fmu"), stop_time=6.0, output_interval=0.1)
-    np.testing.assert_allclose(shown["value"], expected, atol=1e-6)
+    displayed = simulate_fmu(str(tmp_path / "m.fmu"), stop_time=6.0, output_interval=0.1)
+    np.testing.assert_allclose(displayed["value"], expected, atol=1e-6)
 
 
 def test_a_table_of_two_variables_and_straight_lines() -> None:
@@ -255,9 +255,9 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
 
 @pytest.mark.parametrize("what", WRONG)
 def test_what_is_wrong_is_said_in_a_sentence(what: str) -> None:
-    given, words, sentence = WRONG[what]
+    inputs, words, sentence = WRONG[what]
     with pytest.raises(psa.InputError) as caught:
-        psa.ode_model(given(), **{"name": "model", **words})
+        psa.ode_model(inputs(), **{"name": "model", **words})
     assert sentence in str(caught.value)
     for problem in caught.value.problems:
         assert problem.endswith(".")
@@ -344,11 +344,11 @@ def neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
     """A current folder with files of the names of what is imported; each tells that it ran."""
     here = tmp_path / "here"
     here.mkdir()
-    tells = "from pathlib import Path; Path(__file__).with_suffix('.ran').touch()\n"
+    text = "from pathlib import Path; Path(__file__).with_suffix('.ran').touch()\n"
     install(tmp_path / "site", "import rulings\n" + RIPPLE)
     (tmp_path / "site" / "rulings.py").touch()
-    install(here, tells + RIPPLE)
-    (here / "rulings.py").write_text(tells)
+    install(here, text + RIPPLE)
+    (here / "rulings.py").write_text(text)
     monkeypatch.chdir(here)
     monkeypatch.syspath_prepend(tmp_path / "site")
     _forget()
@@ -411,7 +411,7 @@ def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
     )  # fmt: skip
     t = 0.02 * np.arange(201.0)
     u = np.sin(2.0 * t)
-    shown = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
+    displayed = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
     path = tmp_path / "any.fmu"
     psa.export_fmu(model, path)
     played = simulate_fmu(
@@ -421,4 +421,4 @@ def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
         ),
     )  # fmt: skip
     again = np.interp(t, played["time"], played["velocity"])
-    assert np.max(np.abs(again - shown)) < 1e-5 * np.ptp(shown)
+    assert np.max(np.abs(again - displayed)) < 1e-5 * np.ptp(displayed)

@@ -28,9 +28,9 @@ OWN = {f.__name__: f for f in (oscillator, motor, tanks, pair, cylinder, oven)}
 def again(model: Model) -> Model:
     """Return a model as it comes back from its file, which is the same when written again."""
     text = dumps(model)
-    found = loads(text)
-    assert dumps(found) == text
-    return found
+    content = loads(text)
+    assert dumps(content) == text
+    return content
 
 
 def assert_computes_the_same(model: Model, other: Model, rtol: float = 1e-13) -> None:
@@ -59,13 +59,13 @@ def assert_computes_the_same(model: Model, other: Model, rtol: float = 1e-13) ->
 @pytest.mark.parametrize("ported", [False, True])
 def test_a_model_of_ones_own_comes_back_exactly(name: str, ported: bool) -> None:
     model = with_ports(OWN[name]()) if ported else OWN[name]()
-    found = again(model)
-    assert dict(found.values) == dict(model.values)
+    result = again(model)
+    assert dict(result.values) == dict(model.values)
     for kind in ("parameters", "states", "inputs", "outputs"):
-        assert getattr(found.structure, kind) == getattr(model.structure, kind)
-    assert ports_of(found) == ports_of(model)
-    assert found.structure.balance_table == model.structure.balance_table
-    assert_computes_the_same(model, found)
+        assert getattr(result.structure, kind) == getattr(model.structure, kind)
+    assert ports_of(result) == ports_of(model)
+    assert result.structure.balance_table == model.structure.balance_table
+    assert_computes_the_same(model, result)
 
 
 @pytest.mark.parametrize("name", OWN)
@@ -81,46 +81,46 @@ def test_every_effect_at_a_port_comes_back_exactly(name: str) -> None:
         for c in whole.effects
     }
     whole = whole.with_values(gains)
-    found = again(whole)
-    for mine, its in zip(whole.effects, found.effects, strict=True):
+    result = again(whole)
+    for mine, its in zip(whole.effects, result.effects, strict=True):
         for field in ("name", "description", "source", "gain", "linear", "belongs_to", "looks_like",
                       "equation_text", "parameters", "states"):  # fmt: skip
             assert getattr(its, field) == getattr(mine, field), (mine.name, field)
-    assert_computes_the_same(whole, found)
-    assert found.plant().output_names == whole.plant().output_names
+    assert_computes_the_same(whole, result)
+    assert result.plant().output_names == whole.plant().output_names
 
 
 def test_every_component_of_the_package_could_be_written_with_its_equations() -> None:
     """Copies, which no table has: the texts hold all physics of a stack and its effects."""
     model = model_named("every_effect")
     copies = compose([replace(c) for c in model.components], model.values, name="copies")
-    found = loads(dumps(copies))
+    content = loads(dumps(copies))
     assert set(json.loads(dumps(copies))["own"]) == {c.name for c in model.components}
-    assert_computes_the_same(model, found, rtol=1e-12)
+    assert_computes_the_same(model, content, rtol=1e-12)
 
 
 def test_a_connected_system_with_sampled_parts_comes_back() -> None:
     model = loop()
-    found = again(model)
-    assert found.structure.period == model.structure.period
-    assert_computes_the_same(model, found)
+    result = again(model)
+    assert result.structure.period == model.structure.period
+    assert_computes_the_same(model, result)
 
 
 def test_own_components_stand_beside_those_of_the_package() -> None:
-    own = psa.Component(
+    component = psa.Component(
         "pull", "a spring at the tip", "test", gain="k_pull",
         equations=lambda s: psa.Equations(add={"tip_force": -s.k_pull * s.tip_displacement}),
         parameters=(psa.Parameter("k_pull", 0.0, "N/m", (0.0, 1e9), "k", scale=1e6),),
     )  # fmt: skip
-    model = psa.stack_model("demo").with_effect(own, {"k_pull": 2e6 / 3.0})
-    found = again(model)
+    model = psa.stack_model("demo").with_effect(component, {"k_pull": 2e6 / 3.0})
+    result = again(model)
     content = json.loads(dumps(model))
     assert list(content["own"]) == ["pull"]
     assert content["own"]["pull"]["equations"] == {
         "add": {"tip_force": "-(k_pull * tip_displacement)"}
     }
-    assert [c for c in found.components if c.name != "pull"] == list(model.components[:-1])
-    assert_computes_the_same(model, found)
+    assert [c for c in result.components if c.name != "pull"] == list(model.components[:-1])
+    assert_computes_the_same(model, result)
 
 
 def test_starts_bounds_and_usual_sizes_come_back() -> None:
@@ -130,10 +130,10 @@ def test_starts_bounds_and_usual_sizes_come_back() -> None:
         states=[psa.State("x", "m", "place", lambda v: 3.0 * v["a"], 0.25, memory=True)],
         parameters=[psa.Parameter("a", 2.0, "1/s", (0.5, np.inf), "rate", "1/min", log=True)],
     ).with_starts({"x": 1.0 / 3.0})  # fmt: skip
-    found = again(model)
-    assert found.own_starts() == {"x": 1.0 / 3.0}
-    assert found.parameter("a") == model.parameter("a")
-    (state,) = found.structure.states
+    result = again(model)
+    assert result.own_starts() == {"x": 1.0 / 3.0}
+    assert result.parameter("a") == model.parameter("a")
+    (state,) = result.structure.states
     assert (state.nominal, state.memory, state.settles) == (6.0, True, True)
 
 
@@ -150,8 +150,8 @@ def test_what_could_not_be_read_again_is_not_saved() -> None:
 
 
 def own(content: dict[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = content["own"]["motor"]
-    return found
+    table: dict[str, Any] = content["own"]["motor"]
+    return table
 
 
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
@@ -216,11 +216,11 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_mistake_in_an_own_component_is_named(case: str) -> None:
-    change, said = HOSTILE[case]
+    change, statement = HOSTILE[case]
     content = json.loads(dumps(motor()))
     change(content)
     began = time.process_time()
-    with pytest.raises(psa.InputError, match=r"m\.json") as told:
+    with pytest.raises(psa.InputError, match=r"m\.json") as output:
         loads(json.dumps(content), "m.json")
-    assert said in str(told.value)
+    assert statement in str(output.value)
     assert time.process_time() - began < 2.0

@@ -86,11 +86,11 @@ def test_the_compensator_takes_the_stack_s_effects_on_the_force(effect: str, gai
         model = psa.connect(
             {"compensator": psa.compensator_for(known), "stack": stack}, wires, name="m"
         )
-        found = _driven(model, t, compensator_command=80.0 * wave)
+        result = _driven(model, t, compensator_command=80.0 * wave)
         lag = stack.values["tau"] + stack.values["R_s"] * stack.values["C_p"]
         late = 40.0 * (1.0 - np.cos(2.0 * np.pi * 20.0 * (t - lag)))
         ideal = stack.values["k_L"] * late
-        errors.append(np.abs(found["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
+        errors.append(np.abs(result["stack_f_out"] - ideal)[last].max() / np.ptp(ideal))
     assert errors[0] < 1e-3
     assert errors[1] > 1e-2
 
@@ -104,11 +104,11 @@ def test_the_voltage_amplifier_has_bandwidth_range_and_slew_rate() -> None:
     assert beyond.max() <= 120.0 + 1e-6
     assert beyond[-1] == pytest.approx(120.0, abs=1e-3)
     slow = psa.part_model("voltage_amplifier", bandwidth=1e5, current_limit=0.05)
-    found = _driven(slow, t, command=np.full_like(t, 10.0))
+    result = _driven(slow, t, command=np.full_like(t, 10.0))
     slew = 0.05 / 1.5e-6
-    assert found["load_current"].max() <= 0.05
-    middle = (found["output_voltage"] > 10.0) & (found["output_voltage"] < 80.0)
-    rate = np.polyfit(t[middle], found["output_voltage"][middle], 1)[0]
+    assert result["load_current"].max() <= 0.05
+    middle = (result["output_voltage"] > 10.0) & (result["output_voltage"] < 80.0)
+    rate = np.polyfit(t[middle], result["output_voltage"][middle], 1)[0]
     assert rate == pytest.approx(slew, rel=1e-3)
 
 
@@ -171,10 +171,10 @@ def test_the_controller_is_the_recursion_of_a_textbook() -> None:
     for k in range(200):
         expected.append(plain(wanted(k * 5e-5), position))
         position = 1e-6 * expected[-1]
-    found = _closed_on(model, wanted, 200)
-    assert found.max() == 12.0
-    assert found.min() == -2.0
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    values = _closed_on(model, wanted, 200)
+    assert values.max() == 12.0
+    assert values.min() == -2.0
+    np.testing.assert_allclose(values, expected, atol=1e-9)
 
 
 def test_the_plain_loop_has_the_reference_s_stack() -> None:
@@ -184,13 +184,13 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
     values["flexure"] |= {"k_c": 1e-3, "c_c": 0.0}
     values["amplifier"]["bandwidth"] = 2e3
     values["controller"] |= {"proportional_gain": 0.0, "integral_gain": 0.0, "feed_forward": 1e6}
-    found = simulate_positioner(
+    run = simulate_positioner(
         values, lambda t: 3e-6 * (1.0 - math.cos(400.0 * math.pi * t)), 0.005, 1e-5
     )
-    voltage = _smooth(found.time, found.voltage)
-    plant = reference.simulate(VALUES, voltage, found.time, rtol=1e-8)
+    voltage = _smooth(run.time, run.voltage)
+    plant = reference.simulate(VALUES, voltage, run.time, rtol=1e-8)
     assert np.ptp(plant.displacement) > 5e-6
-    np.testing.assert_allclose(found.tip, plant.displacement, atol=1e-4 * np.ptp(found.tip))
+    np.testing.assert_allclose(run.tip, plant.displacement, atol=1e-4 * np.ptp(run.tip))
 
 
 @pytest.mark.parametrize(
@@ -267,12 +267,12 @@ def test_a_connected_model_has_the_equations_of_its_parts() -> None:
         tip = np.array([x[stack.state_names.index("x")], x[stack.state_names.index("v_x")]])
         slope, out = stage.structure.f(0.0, x_f, tip, stage.parameter_vector())
         force = float(out[stage.output_names.index("reaction_force")])
-        own, shown = stack.structure.f(0.0, x, [30.0, force], stack.parameter_vector())
+        item, displayed = stack.structure.f(0.0, x, [30.0, force], stack.parameter_vector())
         got = both.structure.f(0.0, [*x, *x_f], [30.0], both.parameter_vector())
-        parts = [np.array(v).ravel() for v in (own, slope, shown, out)]
+        parts = [np.array(v).ravel() for v in (item, slope, displayed, out)]
         expected = np.concatenate(parts[:2]), np.concatenate(parts[2:])
-        for found, wanted in zip(got, expected, strict=True):
-            np.testing.assert_allclose(np.array(found).ravel(), wanted, rtol=1e-13)
+        for result, wanted in zip(got, expected, strict=True):
+            np.testing.assert_allclose(np.array(result).ravel(), wanted, rtol=1e-13)
 
 
 def test_every_mistake_in_the_wires_is_told_at_once() -> None:
@@ -316,35 +316,35 @@ def _reference(t: float) -> float:
 def test_the_closed_loop_is_that_of_an_independent_simulation(compensated: bool) -> None:
     """Position, command and voltage at every instant, against the loop in plain Python."""
     system = psa.nanopositioner(compensated=compensated)
-    found = simulate_positioner(
+    run = simulate_positioner(
         {n: m.values for n, m in system.parts.items()}, _reference, 4e-3, 5e-5
     )
     model = system.model()
-    samples = np.array([[_reference(t)] for t in found.time])
-    steps = psa.run(model, found.time, samples, np.zeros(len(model.state_names)), rtol=1e-9)
-    shown = dict(zip(model.output_names, steps.y.T, strict=True))
-    assert np.ptp(found.position) > 8e-6
-    np.testing.assert_allclose(shown["stage_position"], found.position, atol=1e-12)
-    np.testing.assert_allclose(shown["command"], found.command, atol=1e-6)
-    np.testing.assert_allclose(shown["voltage"], found.voltage, atol=1e-5)
+    samples = np.array([[_reference(t)] for t in run.time])
+    steps = psa.run(model, run.time, samples, np.zeros(len(model.state_names)), rtol=1e-9)
+    displayed = dict(zip(model.output_names, steps.y.T, strict=True))
+    assert np.ptp(run.position) > 8e-6
+    np.testing.assert_allclose(displayed["stage_position"], run.position, atol=1e-12)
+    np.testing.assert_allclose(displayed["command"], run.command, atol=1e-6)
+    np.testing.assert_allclose(displayed["voltage"], run.voltage, atol=1e-5)
 
 
 @pytest.mark.parametrize("stack", ["P-885.51", "PTBS200", "WYDS0808020"])
 def test_the_tuned_loop_keeps_its_margins(stack: str) -> None:
     """The sensitivity asked for is met with the resonance where it is, and used up nearly."""
     plant = positioner_plant(stack).model()
-    found = {}
+    table = {}
     for limit in (1.4, 1.6):
         tuned = psa.controller_for(plant, position="stage_position", sensitivity=limit)
-        found[limit] = psa.margins_of(plant, tuned, "stage_position")
-        assert 1.2 < found[limit].sensitivity <= limit * 1.0001
-        assert found[limit].gain > limit / (limit - 1.0)
-        assert found[limit].phase > 2.0 * np.arcsin(0.5 / limit)
+        table[limit] = psa.margins_of(plant, tuned, "stage_position")
+        assert 1.2 < table[limit].sensitivity <= limit * 1.0001
+        assert table[limit].gain > limit / (limit - 1.0)
+        assert table[limit].phase > 2.0 * np.arcsin(0.5 / limit)
         for share in (0.9, 1.1):
             notch = share * tuned.values["notch_frequency"]
-            beside = tuned.with_values({"notch_frequency": notch})
-            assert psa.margins_of(plant, beside, "stage_position").sensitivity <= limit * 1.0001
-    assert found[1.6].crossover > found[1.4].crossover > 50.0
+            model = tuned.with_values({"notch_frequency": notch})
+            assert psa.margins_of(plant, model, "stage_position").sensitivity <= limit * 1.0001
+    assert table[1.6].crossover > table[1.4].crossover > 50.0
 
 
 def test_a_plant_that_cannot_be_tuned_is_refused() -> None:

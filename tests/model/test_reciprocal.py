@@ -21,10 +21,10 @@ def reciprocal(name: str, gain: float, **changes: float) -> psa.Model:
 
 def plant(name: str, **changes: float) -> Stack:
     p = {key: figure.value for key, figure in psa.STACKS[name].values.items()} | changes
-    own = {q: p[q] for q in ("u_rated", "beta", "gamma", "delta", "n", "h_ref", "tau")}
+    table = {q: p[q] for q in ("u_rated", "beta", "gamma", "delta", "n", "h_ref", "tau")}
     return Stack(
         r_s=p["R_s"], c_p_el=p["C_p"], k_l=p["k_L"], a=p["A"], m_p=p["m_P"], c_p=p["c_P"],
-        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **own,
+        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **table,
     )  # fmt: skip
 
 
@@ -70,12 +70,12 @@ def test_a_step_is_that_of_two_masses_with_action_and_reaction(name: str) -> Non
     """With hysteresis, against matrices and an exponential; the cascade is far away."""
     run = driven(name, 2e-3, 2000)
     truth = two_masses(run)
-    found, one_way = (
+    result, one_way = (
         psa.simulate(reciprocal(name, g), run.times, run.command, from_rest_at_zero=True, rtol=1e-8)
         for g in (1.0, 0.0)
     )
     size = np.ptp(truth)
-    assert np.abs(found.displacement - truth).max() < 2e-5 * size
+    assert np.abs(result.displacement - truth).max() < 2e-5 * size
     assert np.abs(one_way.displacement - run.displacement).max() < 2e-5 * np.ptp(run.displacement)
     ratio = truth[-1] / run.displacement[-1]
     assert np.abs(truth - ratio * run.displacement).max() > 2e-3 * size

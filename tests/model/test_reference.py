@@ -254,7 +254,7 @@ def test_displacement_agrees_with_the_reference(
     def load(time: float) -> float:
         return force * sin(7.0 * time / duration) if drive.hold == "linear" else 0.0
 
-    found = psa.simulate(
+    result = psa.simulate(
         model, t, samples, load_force=[load(s) for s in t],
         from_rest_at_zero=True, rtol=1e-8, hold=drive.hold,
     )  # fmt: skip
@@ -263,12 +263,12 @@ def test_displacement_agrees_with_the_reference(
         p, voltage, t[every], load_force=load, mechanics=mechanics,
         breakpoints=[b * duration for b in drive.breakpoints], rtol=1e-10,
     )  # fmt: skip
-    error = np.abs(found.outputs["displacement"][every] - true.displacement).max()
+    error = np.abs(result.outputs["displacement"][every] - true.displacement).max()
     assert error < 1e-6 * np.ptp(true.displacement)
     for name, wanted in (
         ("velocity", true.velocity),
         ("charge", true.charge),
         ("blocked_force", true.blocked_force),
     ):
-        difference = np.abs(found.outputs[name][every] - wanted).max()
+        difference = np.abs(result.outputs[name][every] - wanted).max()
         assert difference < 1e-5 * np.ptp(wanted), name

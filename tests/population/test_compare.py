@@ -30,9 +30,9 @@ HOSTILE = "<img src=x onerror=alert(1)>&<b>bold</b>"
 
 
 def finding(name: str, k_l: float, **more: Any) -> Finding:
-    own = {"k_L": Found(k_l, "N/V", (0.99 * k_l, 1.01 * k_l), meaning="linear force per volt")}
+    table = {"k_L": Found(k_l, "N/V", (0.99 * k_l, 1.01 * k_l), meaning="linear force per volt")}
     return Finding(
-        name, "identification", own, (("r", name),), rms_m=2e-9, rms_percent=0.02, **more
+        name, "identification", table, (("r", name),), rms_m=2e-9, rms_percent=0.02, **more
     )
 
 
@@ -47,10 +47,15 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def test_a_model_and_a_finding_of_the_same_records_are_one_device(tmp_path: Path) -> None:
-    found = identification()
-    hashes = [{"record": e.record.name, "sha256": e.record.sha256} for e in found.experiments]
+    stack_identification = identification()
+    hashes = [
+        {"record": e.record.name, "sha256": e.record.sha256}
+        for e in stack_identification.experiments
+    ]
     content = {**json.loads(dumps(evident_model())), "identified_from": hashes}
-    (tmp_path / "a.json").write_text(json_text(identification_file(found)), encoding="utf-8")
+    (tmp_path / "a.json").write_text(
+        json_text(identification_file(stack_identification)), encoding="utf-8"
+    )
     (tmp_path / "model.json").write_text(json.dumps(content), encoding="utf-8")
     (joined,) = read_findings([tmp_path / "model.json", tmp_path / "a.json"])
     assert joined.device == "a"
@@ -63,8 +68,8 @@ def test_what_a_record_is_compared_with_has_the_sensors_errors() -> None:
     bent = plain.with_effect(EFFECTS["sensor_nonlinearity"])
     gain = EFFECTS["sensor_nonlinearity"].gain or ""
     far = replace(bent, values={**bent.values, gain: 0.05})
-    found = [replayed(m) for m in (plain, bent, far)]
-    a, b, c = (np.array(t.model) for t in found if t is not None)
+    items = [replayed(m) for m in (plain, bent, far)]
+    a, b, c = (np.array(t.model) for t in items if t is not None)
     np.testing.assert_allclose(b, a, atol=1e-5 * float(np.ptp(a)))
     assert np.max(np.abs(c - a)) > 1e-3 * float(np.ptp(a))
 
@@ -122,42 +127,42 @@ def devices() -> list[Finding]:
     sizes = 7.0 * np.exp(0.01 * rng.standard_normal(40))
     sizes[20:] *= 1.04
     sizes[5] *= 1.3
-    found = []
+    items = []
     for k, size in enumerate(sizes.tolist()):
-        own = finding(
+        item = finding(
             f"d{k}", size, batch="A" if k < 20 else "B", day=date(2024 + k // 20, 1 + k % 12, 1)
         )
         tau = 1e-3 * float(np.exp(0.02 * rng.standard_normal()))
         more = {"tau": Found(tau, "s", (0.98 * tau, 1.02 * tau), meaning="lag")}
-        found.append(replace(own, parameters={**own.parameters, **more}))
-    return found
+        items.append(replace(item, parameters={**item.parameters, **more}))
+    return items
 
 
 def test_a_population_says_who_stands_out_and_which_batch(tmp_path: Path) -> None:
-    found = population(devices())
-    assert {o.device for o in found.outliers} == {"d5"}
-    assert found.batches_differ == ("k_L",)
-    assert found.drifting == ("k_L",)
+    result = population(devices())
+    assert {o.device for o in result.outliers} == {"d5"}
+    assert result.batches_differ == ("k_L",)
+    assert result.drifting == ("k_L",)
     page = tmp_path / "population.html"
-    write_population(found, page, without=[(HOSTILE, "refused", "line 2 <script>")])
-    shown = Page(page.read_text(encoding="utf-8"))
-    assert shown.loaded == []
+    write_population(result, page, without=[(HOSTILE, "refused", "line 2 <script>")])
+    displayed = Page(page.read_text(encoding="utf-8"))
+    assert displayed.loaded == []
     assert "1 of 40 devices stands out: d5. Batches differ in k_L. Over the date, k_L drifts." in (
-        shown.text
+        displayed.text
     )
-    assert HOSTILE in shown.text
+    assert HOSTILE in displayed.text
     assert len(figures(page.read_text(encoding="utf-8"))) >= 3
 
 
 def test_the_pictures_name_the_devices_of_the_table() -> None:
-    found = population(devices())
-    spread = next(s for s in found.spreads if s.estimates.name == "k_L")
-    for plot in (spread_plot(found, spread), drift_plot(found, spread)):
+    result = population(devices())
+    spread = next(s for s in result.spreads if s.estimates.name == "k_L")
+    for plot in (spread_plot(result, spread), drift_plot(result, spread)):
         others, apart = plot.data
         assert apart["name"] == "stands out"
         assert [t.strip() for t in apart["text"]] == apart["hovertext"] == ["d5"]
         assert (len(others["x"]), set(others["text"])) == (39, {""})
-    axis = spread_plot(found, spread).layout["xaxis"]
+    axis = spread_plot(result, spread).layout["xaxis"]
     assert axis["ticktext"] == [str(k + 1) for k in axis["tickvals"]]
     few = population(devices()[:6])
     plot = spread_plot(few, few.spreads[0])
@@ -168,17 +173,17 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     assert set(axis["ticktext"]) == {f"d{k}" for k in range(6)}
     # found in this parameter by itself, and not among all tests
     assert spread.far.found.sum() == 1
-    (only,) = spread_plot(replace(found, outliers=()), spread).data
+    (only,) = spread_plot(replace(result, outliers=()), spread).data
     assert (only["name"], len(only["x"])) == ("belongs to the others", 40)
 
 
 def test_a_population_says_whose_fits_miss_their_records() -> None:
     assert missed_sentences(devices()) == ()
-    found = [replace(f, missed=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
-    (said,) = missed_sentences(found)
-    assert said in population_sentences(population(found))
-    assert "The fits of d7 (9.0 times the noise), d6" in said
-    assert "d2 (4.0 times the noise) and 2 more miss their records" in said
+    items = [replace(f, missed=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
+    (statement,) = missed_sentences(items)
+    assert statement in population_sentences(population(items))
+    assert "The fits of d7 (9.0 times the noise), d6" in statement
+    assert "d2 (4.0 times the noise) and 2 more miss their records" in statement
 
 
 @slow
@@ -199,6 +204,6 @@ def test_the_pages_in_a_browser(
         assert '<svg class="main-svg"' in box
     for flags in ((), (DARK,)):
         assert browser.serious_faults(page, *flags) == []
-    found = seen_on_a_phone(browser, page)
-    assert found["width"] == found["needed"] == PHONE
-    assert found["outside"] == []
+    table = seen_on_a_phone(browser, page)
+    assert table["width"] == table["needed"] == PHONE
+    assert table["outside"] == []

@@ -81,12 +81,12 @@ def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
 def test_z_is_the_studentized_deleted_residual() -> None:
     """With one noise for all, tau and noise together are the variance of the others."""
     y = np.random.default_rng(5).standard_normal(12)
-    found = outliers(y, np.full(12, 1e-3))
+    result = outliers(y, np.full(12, 1e-3))
     for i in range(12):
         others = np.delete(y, i)
         z = (y[i] - others.mean()) / (others.std(ddof=1) * np.sqrt(1 + 1 / 11))
-        assert found.z[i] == pytest.approx(z, rel=1e-6)
-        assert found.p[i] == pytest.approx(2 * stats.t.sf(abs(z), 10), rel=1e-5)
+        assert result.z[i] == pytest.approx(z, rel=1e-6)
+        assert result.p[i] == pytest.approx(2 * stats.t.sf(abs(z), 10), rel=1e-5)
 
 
 def test_outliers_do_not_hide_each_other() -> None:
@@ -94,8 +94,8 @@ def test_outliers_do_not_hide_each_other() -> None:
     s = rng.uniform(0.5, 1.5, 60)
     y = rng.standard_normal(60) + s * rng.standard_normal(60)
     y[[3, 17, 40]] += [9.0, 10.0, -11.0]
-    found = outliers(y, s)
-    assert set(np.flatnonzero(found.found)) == {3, 17, 40}
+    result = outliers(y, s)
+    assert set(np.flatnonzero(result.found)) == {3, 17, 40}
 
 
 def test_p_values_are_adjusted_as_defined() -> None:
@@ -109,27 +109,27 @@ def test_batches_are_the_analysis_of_variance_where_noise_is_small() -> None:
     rng = np.random.default_rng(8)
     names = [n for n in "abc" for _ in range(7)]
     y = rng.standard_normal(21) + np.repeat([0.0, 0.0, 2.0], 7)
-    found = batch_test(y, np.full(21, 1e-3), names)
+    result = batch_test(y, np.full(21, 1e-3), names)
     expected = stats.f_oneway(y[:7], y[7:14], y[14:])
-    assert found.f == pytest.approx(expected.statistic, rel=1e-5)
-    assert found.p_value == pytest.approx(expected.pvalue, rel=1e-4)
+    assert result.f == pytest.approx(expected.statistic, rel=1e-5)
+    assert result.p_value == pytest.approx(expected.pvalue, rel=1e-4)
     parts = y.reshape(3, 7)
     noise = np.sqrt(parts.var(axis=1, ddof=1).mean() * (1 / 7 + 1 / 14))
     differs = [parts[k].mean() - np.delete(parts, k, 0).mean() for k in range(3)]
     p = np.sort(2 * stats.t.sf(np.abs(differs) / noise, 18)) * [3, 2, 1]
-    assert [b.differs_by for b in found.batches] == pytest.approx(differs)
-    assert sorted(b.p_adjusted for b in found.batches) == pytest.approx(p, rel=1e-3)
-    assert found.batches[2].mean == pytest.approx(y[14:].mean())
+    assert [b.differs_by for b in result.batches] == pytest.approx(differs)
+    assert sorted(b.p_adjusted for b in result.batches) == pytest.approx(p, rel=1e-3)
+    assert result.batches[2].mean == pytest.approx(y[14:].mean())
 
 
 def test_drift_is_linear_regression_where_noise_is_small() -> None:
     rng = np.random.default_rng(9)
     t = np.sort(rng.uniform(2024.0, 2026.0, 30))
     y = 0.8 * t + rng.standard_normal(30)
-    found = drift(y, np.full(30, 1e-3), t)
+    result = drift(y, np.full(30, 1e-3), t)
     expected = stats.linregress(t, y)
-    assert found.slope == pytest.approx(expected.slope, rel=1e-6)
-    assert found.p_value == pytest.approx(expected.pvalue, rel=1e-3)
+    assert result.slope == pytest.approx(expected.slope, rel=1e-6)
+    assert result.p_value == pytest.approx(expected.pvalue, rel=1e-3)
 
 
 @pytest.mark.parametrize("errors", [(1.0, 0.0, 1.0), (1.0, np.nan, 1.0)])
@@ -142,20 +142,20 @@ def test_errors_that_are_none_are_refused(errors: tuple[float, ...]) -> None:
 
 def finding(name: str, k_l: float, half: float, **more: Any) -> Finding:
     """Return a device with one parameter that is told and one that is not."""
-    own = {
+    table = {
         "k_L": Found(k_l, "N/V", (k_l * np.exp(-half), k_l * np.exp(half))),
         "tau": Found(1e-3, "s", (1e-9, 1.0), told=False),
     }
-    return Finding(name, "identification", own, **more)
+    return Finding(name, "identification", table, **more)
 
 
 def test_a_population_tells_outliers_and_causes() -> None:
     rng = np.random.default_rng(2)
     sizes = 7.0 * np.exp(0.01 * rng.standard_normal(30))
     sizes[4] *= 1.2
-    found = population([finding(f"d{k}", v, 0.005) for k, v in enumerate(sizes)])
-    assert {o.device for o in found.outliers} == {"d4"}
-    (spread,) = found.spreads
+    result = population([finding(f"d{k}", v, 0.005) for k, v in enumerate(sizes)])
+    assert {o.device for o in result.outliers} == {"d4"}
+    (spread,) = result.spreads
     assert spread.estimates.log
     assert 0.006 < spread.common.tau < 0.015
     with pytest.raises(InputError, match="no population"):
@@ -167,8 +167,8 @@ def test_a_population_tells_outliers_and_causes() -> None:
 
 def test_two_findings_are_compared_by_their_z() -> None:
     a, b = finding("a", 7.0, 0.02), finding("b", 7.5, 0.02)
-    (found,) = differences([a, b])
+    (result,) = differences([a, b])
     z = np.log(7.5 / 7.0) / (np.sqrt(2.0) * 0.02 / 1.959964)
-    assert found.p_value == pytest.approx(2 * stats.norm.sf(z), rel=1e-6)
-    assert found.differs
+    assert result.p_value == pytest.approx(2 * stats.norm.sf(z), rel=1e-6)
+    assert result.differs
     assert not differences([a, finding("c", 7.05, 0.02)])[0].differs

@@ -21,12 +21,12 @@ TRUTH = {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}
 @cache
 def records(seed: int) -> tuple[psa.Signals, ...]:
     """Return two records of a motor: speed and current, and the speed with four times the noise."""
-    found = []
+    items = []
     for k, (noise, names) in enumerate(((1.0, ("voltage", "w", "i")), (4.0, ("voltage", "w")))):
         whole = plants.motor(seed + k, friction=0.0, noise=noise)
         columns = {n: whole.columns[n][:600] for n in names}
-        found.append(psa.Signals(name=f"run_{k + 1}", time=whole.time[:600], columns=columns))
-    return tuple(found)
+        items.append(psa.Signals(name=f"run_{k + 1}", time=whole.time[:600], columns=columns))
+    return tuple(items)
 
 
 @cache
@@ -55,36 +55,36 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     arviz = pytest.importorskip("arviz")
     held = []
     for seed in (1, 3):
-        found = psa.sample(
+        result = psa.sample(
             motor(), records(seed), starts=1, chains=2, draws=250, tune=200, seed=seed
         )
         fitted = psa.identify(motor(), records(seed), starts=1)
-        for f in found.figures:
-            draws = found.tree.posterior[f.name].to_numpy()
+        for f in result.figures:
+            draws = result.tree.posterior[f.name].to_numpy()
             low, high = np.quantile(draws, [0.05, 0.95])
             held.append(low < TRUTH[f.name] < high)
             assert abs(f.mean - TRUTH[f.name]) < 4.0 * f.sd
             assert f.sd == pytest.approx(fitted.errors[f.name], rel=0.2)
-        assert not found.divergences
+        assert not result.divergences
     assert sum(held) >= 5  # of 8 that hold it with 90 %: fewer in 0.5 % of all data
-    found.save(tmp_path / "posterior.nc")
+    result.save(tmp_path / "posterior.nc")
     tree = arviz.from_netcdf(tmp_path / "posterior.nc")
-    shown = tree.posterior_predictive.i_1.to_numpy()[0]
-    low, high = np.quantile(shown, [0.03, 0.97], axis=0)
+    displayed = tree.posterior_predictive.i_1.to_numpy()[0]
+    low, high = np.quantile(displayed, [0.03, 0.97], axis=0)
     y = tree.observed_data.i_1.to_numpy()
     assert 0.88 < np.mean((y > low) & (y < high)) < 0.98
     assert tree.posterior_predictive.w_2.attrs["units"] == "rad/s"
     levels = tree.posterior_predictive.noise_w.to_numpy().mean(axis=(0, 1))
     np.testing.assert_allclose(levels, [0.3, 1.2], rtol=0.1)
-    found.report(tmp_path / "page.html")
+    result.report(tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text("utf-8"))
     assert (
         "The posterior of motor, given 2 records: 2 chains of 250 draws, 0 divergent." in page.text
     )
     assert "run_2 w" in page.text
     assert page.loaded == []
-    assert list(found.to_frame()["name"]) == list(TRUTH)
-    assert "run_2" in found.plot()._suptitle.get_text()  # type: ignore[attr-defined]
+    assert list(result.to_frame()["name"]) == list(TRUTH)
+    assert "run_2" in result.plot()._suptitle.get_text()  # type: ignore[attr-defined]
 
 
 def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
@@ -111,5 +111,5 @@ def test_the_command_samples_a_model_of_ones_own(tmp_path: Path) -> None:
     )  # fmt: skip
     assert list(json.loads(files[1].read_text("utf-8"))["parameters"]) == ["R", "k"]
     assert all(file.stat().st_size for file in files)
-    told = refused("sample", tmp_path / "run.csv", "--known-start", "--free", "R")
-    assert "--known-start is said of a model of your own; add --model" in told
+    output = refused("sample", tmp_path / "run.csv", "--known-start", "--free", "R")
+    assert "--known-start is said of a model of your own; add --model" in output

@@ -49,14 +49,14 @@ def test_a_normal_posterior_is_found() -> None:
 
     free = np.full(3, np.inf)
     density = Density(evaluate, (), Within(-free, free), np.zeros(3), 0.3 * np.eye(3))
-    found = chains_of(density, chains=2, draws=1000, tune=300, seed=3)
-    theta = np.array([density.theta(u) for u in found.u.reshape(-1, 3)])
+    result = chains_of(density, chains=2, draws=1000, tune=300, seed=3)
+    theta = np.array([density.theta(u) for u in result.u.reshape(-1, 3)])
     covariance = np.linalg.inv(slopes.T @ slopes + np.diag(prior**-2.0))
     mean, spread = covariance @ slopes.T @ y, np.sqrt(np.diag(covariance))
     # five standard errors of so many independent draws; the chains are worth no less
     np.testing.assert_allclose((theta.mean(axis=0) - mean) / spread, 0.0, atol=5.0 / 1000**0.5)
     np.testing.assert_allclose(theta.std(axis=0) / spread, 1.0, atol=5.0 / 2000**0.5)
-    assert found.divergences == 0
+    assert result.divergences == 0
 
 
 def test_an_interrupt_ends_the_chains(capfd: pytest.CaptureFixture[str]) -> None:
@@ -86,10 +86,10 @@ def test_an_unknown_level_gives_students_t() -> None:
         Within(-free, free), np.zeros(1), np.eye(1),
     )  # fmt: skip
     at = np.linspace(-3.0, 11.0, 8)
-    found = np.array([density(np.array([u]))[0] for u in at])
+    result = np.array([density(np.array([u]))[0] for u in at])
     t = (at - y.mean()) / np.sqrt(y.var(ddof=1) / 5.0)
     expected = -2.5 * np.log1p(t**2 / 4.0)
-    np.testing.assert_allclose(found - found[0], expected - expected[0], rtol=1e-12)
+    np.testing.assert_allclose(result - result[0], expected - expected[0], rtol=1e-12)
 
 
 def test_bounds_keep_the_density() -> None:
@@ -131,12 +131,12 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
     assert ended.exit_code == 0, ended.output
     assert "94 % interval" in ended.output
     assert picture.read_bytes()[:4] == b"\x89PNG"
-    told = json.loads(figures.read_text("utf-8"))
+    content = json.loads(figures.read_text("utf-8"))
     jsonschema.Draft202012Validator(json.loads(schema_texts()["posterior.schema.json"])).validate(
-        told
+        content
     )
     fitted = task().unknowns.values(task().theta)
-    for name, f in told["parameters"].items():
+    for name, f in content["parameters"].items():
         assert abs(f["mean"] - TRUTH.values[name]) < 4.0 * f["sd"], name
         # the posterior is nearly normal: its mean is the fit's, but for the chains' own error
         assert abs(f["mean"] - fitted[name]) < 5.0 * f["mc_error"] + 0.1 * f["sd"], name
@@ -145,8 +145,8 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
         tree.groups()
     )
     assert tree.posterior.tau.attrs["units"] == "s"
-    shown = tree.posterior_predictive.displacement.to_numpy()[0]
-    low, high = np.quantile(shown, [0.03, 0.97], axis=0)
+    displayed = tree.posterior_predictive.displacement.to_numpy()[0]
+    low, high = np.quantile(displayed, [0.03, 0.97], axis=0)
     y = tree.observed_data.displacement.to_numpy()
     assert 0.88 < np.mean((y > low) & (y < high)) < 0.98
 

@@ -59,29 +59,29 @@ def assert_is(
     np.testing.assert_allclose(moved, np.asarray(x, float), rtol=accuracy)
 
 
-def problems_of(path: Path, **asked: Any) -> tuple[str, ...]:
+def problems_of(path: Path, **options: Any) -> tuple[str, ...]:
     """Return the sentences with which a file is refused; each begins with its name."""
     with pytest.raises(InputError) as caught:
-        read_record(path, **asked)
+        read_record(path, **options)
     begin = (*str(path).split("+"), str(path), "--columns", "... and")
     assert all(p.startswith(begin) for p in caught.value.problems), caught.value
     return caught.value.problems
 
 
-def refused(path: Path, **asked: Any) -> str:
+def refused(path: Path, **options: Any) -> str:
     """Return what is said of a file that is refused."""
-    return "\n".join(problems_of(path, **asked))
+    return "\n".join(problems_of(path, **options))
 
 
-def offered(said: str) -> dict[str, Any]:
+def offered(statement: str) -> dict[str, Any]:
     """Return the options that a message offers once, as the command line would take them."""
-    every = {a or b for a, b in _OFFERED.findall(said + " ")}
-    found = every - {"--columns table=all"}
-    assert len(found) < 2, said
-    words = shlex.split(found.pop()) if found else []
-    asked: dict[str, Any] = {}
+    every = {a or b for a, b in _OFFERED.findall(statement + " ")}
+    result = every - {"--columns table=all"}
+    assert len(result) < 2, statement
+    words = shlex.split(result.pop()) if result else []
+    requested: dict[str, Any] = {}
     if "--columns" in words:
-        asked["columns"] = words[words.index("--columns") + 1]
+        requested["columns"] = words[words.index("--columns") + 1]
     if "--sample-time" in words:
-        asked["sample_time"] = float(words[words.index("--sample-time") + 1])
-    return asked
+        requested["sample_time"] = float(words[words.index("--sample-time") + 1])
+    return requested

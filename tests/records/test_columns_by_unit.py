@@ -109,16 +109,16 @@ def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
     ],
 )
 def test_nothing_is_suggested_that_is_not_meant(head: str, told: str, tmp_path: Path) -> None:
-    said = refused(table(tmp_path / "a.csv", head))
-    assert told in said
-    assert "--columns" not in said
+    statement = refused(table(tmp_path / "a.csv", head))
+    assert told in statement
+    assert "--columns" not in statement
 
 
 def test_columns_without_a_unit_have_that_of_the_name(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", "Elapsed (us),A_mV,B (V),C/nm,D (nm)", columns=(T, V, V, X, X))
     is_read(read_record(path, columns="voltage=A_mV,displacement=C/nm"), 1e-6, 1e-3, 1e-9)
-    said = refused(path, columns="time=Elapsed (us):s,voltage=A_mV,displacement=C/nm")
-    assert "the header gives the unit 'us', --columns gives 's'" in said
+    statement = refused(path, columns="time=Elapsed (us):s,voltage=A_mV,displacement=C/nm")
+    assert "the header gives the unit 'us', --columns gives 's'" in statement
     archive = tmp_path / "a.npz"
     np.savez(archive, a=T, b_mV=V, c_mV=V, x=X)
     is_read(read_record(archive, columns="time=a,voltage=b_mV,displacement=x:um"), 1.0, 1e-3)
@@ -145,10 +145,10 @@ def test_excels_first_line_says_what_separates_the_cells(
 
 def structures(*items: Mapping[str, Any]) -> Any:
     """Return several MATLAB structures of the same fields, as SciPy writes them."""
-    found = np.empty((1, len(items)), dtype=[(key, object) for key in items[0]])
+    result = np.empty((1, len(items)), dtype=[(key, object) for key in items[0]])
     for k, item in enumerate(items):
-        found[0, k] = tuple(item.values())
-    return found
+        result[0, k] = tuple(item.values())
+    return result
 
 
 def recorded(path: Path, *signals: Mapping[str, Any], clocks: int = 1, packed: bool = True) -> Path:

@@ -65,8 +65,10 @@ def bomb(part: str, before: bytes, filler: bytes) -> bytes:
         zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as packed,
     ):
         for name in archive.namelist():
-            own = archive.read(name)
-            packed.writestr(name, own.replace(before, filler + before, 1) if part in name else own)
+            item = archive.read(name)
+            packed.writestr(
+                name, item.replace(before, filler + before, 1) if part in name else item
+            )
     return stream.getvalue()
 
 

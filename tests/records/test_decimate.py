@@ -58,10 +58,10 @@ def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
     assert np.std(residual) == pytest.approx(NOISE / np.sqrt(q), rel=0.05)
     assert abs(np.mean(residual)) < 4 * NOISE / np.sqrt(record.n)
     assert np.max(np.abs(small.voltage - exact)) < 0.1 * NOISE / SLOPE
-    own = np.polyfit(small.voltage, np.asarray(small.displacement), 2)
+    item = np.polyfit(small.voltage, np.asarray(small.displacement), 2)
     full = np.polyfit(record.voltage, np.asarray(record.displacement), 2)
     spread = NOISE / np.sqrt(record.n) / np.array([30.0**2, 30.0, 1.0])
-    assert np.all(np.abs(own - full) < 3 * spread)
+    assert np.all(np.abs(item - full) < 3 * spread)
     assert (small.name, small.source, small.sha256) == (record.name, record.source, record.sha256)
 
 
@@ -158,7 +158,7 @@ def night(n: int, rate: float = 100.0) -> Record:
 
 def test_parts_of_a_long_record_show_every_motion() -> None:
     record = night(1_000_000)
-    parts, said = excerpts([record])
+    parts, statement = excerpts([record])
     assert [p.n for p in parts] == [MOST // PARTS] * PARTS
     assert parts[0].time[0] == record.time[0]
     assert all(p.time[-1] < q.time[0] for p, q in pairwise(parts))
@@ -166,17 +166,17 @@ def test_parts_of_a_long_record_show_every_motion() -> None:
     assert np.sum(np.array(rates) > 3000.0) == 1  # the steps
     assert np.sum((np.array(rates) > 500.0) & (np.array(rates) < 3000.0)) == 1  # the fast loops
     assert {p.sha256 for p in parts} == {record.sha256}
-    assert "of 1000000 samples 4 parts of 50000 are used" in said[0]
-    assert f"{parts[1].time[0]:.4g} s" in said[0]
+    assert "of 1000000 samples 4 parts of 50000 are used" in statement[0]
+    assert f"{parts[1].time[0]:.4g} s" in statement[0]
 
 
 def test_short_records_stay_whole_beside_a_long_one() -> None:
     short, long = night(30_000), night(500_000)
-    parts, said = excerpts([long, short])
+    parts, statement = excerpts([long, short])
     assert parts[-1] is short
     assert sum(p.n for p in parts) <= MOST
     assert sum(p.n for p in parts[:-1]) > MOST - short.n - PARTS
-    assert len(said) == 1
+    assert len(statement) == 1
     assert excerpts([short]) == ([short], [])
     many = [night(LEAST + k) for k in range(12)]
     assert [p.n for p in excerpts(many)[0][:2]] == [LEAST, LEAST // PARTS]
@@ -201,9 +201,9 @@ def test_parts_give_the_answer_of_the_whole_record(
     monkeypatch.setattr(split, "LEAST", 0)
     monkeypatch.setattr(prepare, "MOST", 6_000)
     parts = command([record])
-    said = parts.sentences if command is identify else parts.notes
-    assert any("parts of 1500 are used" in s for s in said)
-    told = parts.model.provenance.intervals
-    assert {"k_L", "A", "n"} <= set(told)
+    statement = parts.sentences if command is identify else parts.notes
+    assert any("parts of 1500 are used" in s for s in statement)
+    output = parts.model.provenance.intervals
+    assert {"k_L", "A", "n"} <= set(output)
     for name in ("k_L", "A", "beta", "n"):
-        assert told[name].low <= whole.model.values[name] <= told[name].high, name
+        assert output[name].low <= whole.model.values[name] <= output[name].high, name

@@ -125,11 +125,11 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
 
 
 def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path) -> None:
-    said = "time=t:s,voltage=U:V,displacement=y:um"
+    text = "time=t:s,voltage=U:V,displacement=y:um"
     mine = ",".join(f"b.csv@{part}" for part in ("time=t:ms", "voltage=CH1:V", "displacement=y:um"))
     first = write(tmp_path / "a.csv", "t,U,y", *ROWS)
     second = write(tmp_path / "b.csv", "t,CH1,y", *ROWS)
-    a, b = read_records([first, second], columns=f"{said},{mine}")
+    a, b = read_records([first, second], columns=f"{text},{mine}")
     assert_is(b, a.time / 1e3, a.voltage, a.displacement)
     (problem,) = problems_of(first, columns=mine)
     assert "line 1" in problem
@@ -251,10 +251,10 @@ def test_instants_and_units_of_parquet(kind: str, tmp_path: Path) -> None:
         pyarrow.field("drive", pyarrow.float64(), metadata={"unit": "V"}),
         pyarrow.field("tip", pyarrow.float64(), metadata={"units": "um"}),
     ]
-    found = pyarrow.Table.from_arrays([time, *numbers], schema=pyarrow.schema(fields))
-    pyarrow.parquet.write_table(found, tmp_path / "a.parquet")
-    asked: dict[str, Any] = {"columns": "time=Timestamp:s"} if kind == "text" else {}
-    record = read_record(tmp_path / "a.parquet", **asked)
+    result = pyarrow.Table.from_arrays([time, *numbers], schema=pyarrow.schema(fields))
+    pyarrow.parquet.write_table(result, tmp_path / "a.parquet")
+    requested: dict[str, Any] = {"columns": "time=Timestamp:s"} if kind == "text" else {}
+    record = read_record(tmp_path / "a.parquet", **requested)
     np.testing.assert_allclose(record.time, T, atol=1e-9)
     assert list(np.flatnonzero(~record.mask)) == [3]
 

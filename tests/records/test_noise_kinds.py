@@ -44,11 +44,11 @@ DRIVES = (triangle, fading, sweep)
 
 def play(u: FloatArray, width: float) -> FloatArray:
     """Return a play operator of the voltage."""
-    found, at = np.empty_like(u), u[0]
+    values, at = np.empty_like(u), u[0]
     for k, v in enumerate(u.tolist()):
         at = min(max(at, v - width), v + width)
-        found[k] = at
-    return found
+        values[k] = at
+    return values
 
 
 def motion(u: FloatArray) -> FloatArray:
@@ -60,8 +60,8 @@ def power_law(slope: float, rng: Rng) -> FloatArray:
     """Return noise with the spectrum f^-slope."""
     f = np.arange(N // 2 + 1) / N
     f[0] = f[1]
-    found: FloatArray = np.fft.irfft(np.fft.rfft(rng.standard_normal(N)) * f ** (-0.5 * slope), N)
-    return np.asarray(found / found.std())
+    values: FloatArray = np.fft.irfft(np.fft.rfft(rng.standard_normal(N)) * f ** (-0.5 * slope), N)
+    return np.asarray(values / values.std())
 
 
 def first_order(r: float, rng: Rng) -> FloatArray:
@@ -209,11 +209,11 @@ def other_loop(u: FloatArray) -> FloatArray:
 
 def other_branches(u: FloatArray) -> FloatArray:
     """Return what exponential branches leave of a straight line (Bouc and Wen)."""
-    z, found = 0.0, np.empty_like(u)
+    z, result = 0.0, np.empty_like(u)
     for k, d in enumerate(np.diff(u, prepend=u[0]).tolist()):
         z += (d - abs(d) * z) / 20.0
-        found[k] = z
-    return found - np.polyval(np.polyfit(u, found, 1), u)
+        result[k] = z
+    return result - np.polyval(np.polyfit(u, result, 1), u)
 
 
 def branches(u: FloatArray) -> FloatArray:
@@ -257,10 +257,10 @@ def test_readings_that_are_held_rounded_or_missing_are_told() -> None:
 
 
 def test_every_kind_has_a_sentence_with_its_figures() -> None:
-    said = []
+    items = []
     for kind in (*KINDS, "outliers"):
         kinds = found(KINDS[kind], fading, 4)
-        said += [note_text(n) for n in notes_of([NoiseFound("loop", "displacement", "m", kinds)])]
-    assert any("The clock of loop jitters by " in s and "own time stamps" in s for s in said)
-    assert any("loop has 12 outliers" in s for s in said)
-    assert all(s.endswith(".") and "loop" in s for s in said)
+        items += [note_text(n) for n in notes_of([NoiseFound("loop", "displacement", "m", kinds)])]
+    assert any("The clock of loop jitters by " in s and "own time stamps" in s for s in items)
+    assert any("loop has 12 outliers" in s for s in items)
+    assert all(s.endswith(".") and "loop" in s for s in items)

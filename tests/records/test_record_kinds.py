@@ -168,10 +168,10 @@ def test_names_that_count_or_mark_are_never_the_time_or_the_drive(
     fill = {"S": np.arange(N), "N": np.arange(N) + 1, "t": T, "d": X, "D": X}
     columns = [fill.get(n[0], X if n == "OUT2 [um]" else V) for n in names]
     path = written(tmp_path, table(head, columns=columns))
-    found, wanted = offered(refused(path)), dict(NAMES[head])
+    result, wanted = offered(refused(path)), dict(NAMES[head])
     parts = wanted.pop("columns", "").split(",")
-    assert {*filter(None, parts)} <= {*found.pop("columns", "").split(",")}
-    assert found == wanted
+    assert {*filter(None, parts)} <= {*result.pop("columns", "").split(",")}
+    assert result == wanted
 
 
 def several(folder: Path) -> dict[str, Path]:
@@ -179,7 +179,7 @@ def several(folder: Path) -> dict[str, Path]:
     second = table(HEAD, columns=(T, 2 * V, X))
     rows = [list(map(float, r)) for r in zip(T, V, X, strict=True)]
     twice = [list(map(float, r)) for r in zip(T, 2 * V, X, strict=True)]
-    beside = table(f"{HEAD},,{HEAD}", columns=(T, V, X, [""] * N, T, 2 * V, X))
+    others = table(f"{HEAD},,{HEAD}", columns=(T, V, X, [""] * N, T, 2 * V, X))
     again = table(HEAD, columns=(np.r_[T, T], np.r_[V, 2 * V], np.r_[X, X]))
     with h5py.File(folder / "groups.h5", "w") as file:
         for k in (1, 2):
@@ -193,7 +193,7 @@ def several(folder: Path) -> dict[str, Path]:
     return {
         "stacked": written(folder, f"{table('rig 3', HEAD)}\nrun 2\n{second}", "stacked.csv"),
         "blocks": written(folder, again, "blocks.csv"),
-        "beside": written(folder, beside, "beside.csv"),
+        "beside": written(folder, others, "beside.csv"),
         "sheets": written(
             folder, xlsx([HEAD.split(","), *rows], [HEAD.split(","), *twice]), "sheets.xlsx"
         ),
@@ -208,10 +208,10 @@ def test_several_tables_are_listed_chosen_and_taken_together(
 ) -> None:
     here(monkeypatch)
     for form, path in several(tmp_path).items():
-        said = refused(path)
-        asked = offered(said)
-        assert "table=all" in said, form
-        is_read(read_record(path, **asked))
+        statement = refused(path)
+        requested = offered(statement)
+        assert "table=all" in statement, form
+        is_read(read_record(path, **requested))
         first, second = read_records([path], columns="table=all")
         is_read(first)
         is_read(second, v=2 * V)
@@ -222,9 +222,9 @@ def test_several_tables_are_listed_chosen_and_taken_together(
 def test_packets_have_no_time_of_their_own(tmp_path: Path) -> None:
     packets = table(HEAD, columns=(np.tile([0.0, 1e-5], N // 2), V, X))
     path = written(tmp_path, packets)
-    said = refused(path)
-    assert "the time begins anew every 2 lines" in said
-    assert offered(said) == {"sample_time": 1e-3}
+    statement = refused(path)
+    assert "the time begins anew every 2 lines" in statement
+    assert offered(statement) == {"sample_time": 1e-3}
     is_read(read_record(path, sample_time=4e-4))
 
 
@@ -278,9 +278,9 @@ def test_settings_beside_the_samples_are_no_samples(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError) as caught:
         read_records(paths)
-    asked = offered(str(caught.value))
-    assert asked == {"columns": "voltage=CH1:V,displacement=CH2:1um"}
-    is_read(*read_records(paths, **asked))
+    requested = offered(str(caught.value))
+    assert requested == {"columns": "voltage=CH1:V,displacement=CH2:1um"}
+    is_read(*read_records(paths, **requested))
     bad = paths[0].read_text().replace(f"{V[3]:10.5f}", "  oops")
     assert "line 4, column 'voltage': found 'oops'" in refused(written(tmp_path, bad, "b.csv"))
 

@@ -51,17 +51,17 @@ def test_periods_show_level_and_colour_beside_a_large_repeated_error(
     drift = 5e-7 * (n / n.size) ** 2
     first = np.where(n < 500, 4e-7 * np.exp(-n / 200.0), 0.0)  # the virgin curve
     y = 1e-7 * v + loop_error(v) + drift + first + noise(v.size, correlation, seed)
-    found = repeats(record(v, y))
-    assert found is not None
-    assert found.level == pytest.approx(LEVEL, rel=0.05)
-    ratio = found.autocovariance[:6] / found.autocovariance[0]
+    result = repeats(record(v, y))
+    assert result is not None
+    assert result.level == pytest.approx(LEVEL, rel=0.05)
+    ratio = result.autocovariance[:6] / result.autocovariance[0]
     assert ratio == pytest.approx(correlation ** np.arange(6), abs=0.06)
-    assert found.distances[0] == pytest.approx(0.5)
-    assert 10_000 < found.samples <= v.size
+    assert result.distances[0] == pytest.approx(0.5)
+    assert 10_000 < result.samples <= v.size
     if correlation:
-        assert found.autoregression[0] == pytest.approx(correlation, abs=0.05)
+        assert result.autoregression[0] == pytest.approx(correlation, abs=0.05)
     else:
-        assert np.all(np.abs(found.autoregression) < 0.05)
+        assert np.all(np.abs(result.autoregression) < 0.05)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
@@ -70,10 +70,12 @@ def test_missing_samples_change_nothing(correlation: float) -> None:
     y = 1e-7 * v + loop_error(v) + noise(v.size, correlation)
     y[np.random.default_rng(1).random(v.size) < 0.2] = np.nan
     y[7_000:8_000] = np.nan
-    found = repeats(record(v, y))
-    assert found is not None
-    assert found.level == pytest.approx(LEVEL, rel=0.05)
-    assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
+    result = repeats(record(v, y))
+    assert result is not None
+    assert result.level == pytest.approx(LEVEL, rel=0.05)
+    assert result.autocovariance[1] / result.autocovariance[0] == pytest.approx(
+        correlation, abs=0.05
+    )
 
 
 def segment() -> FloatArray:
@@ -86,11 +88,11 @@ def test_a_segment_played_twice_counts_from_where_its_history_is_the_same() -> N
     part = segment()
     v = np.concatenate([np.linspace(0, 50, 400), part, np.linspace(50, 5, 900), part, part[:1]])
     y = 1e-7 * v + loop_error(v) + noise(v.size, 0.0)
-    (found,) = repetitions(record(v, y))
-    assert found.lag == 6_900
-    assert abs(found.stop - 6_400) < 6
+    (result,) = repetitions(record(v, y))
+    assert result.lag == 6_900
+    assert abs(result.stop - 6_400) < 6
     both = max(int(np.argmax(part)), int(np.argmin(part)))
-    assert found.settled >= 400 + min(both, 1_500)
+    assert result.settled >= 400 + min(both, 1_500)
     level = repeats(record(v, y))
     assert level is not None
     assert level.level == pytest.approx(LEVEL, rel=0.05)
@@ -118,11 +120,13 @@ def held_levels() -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_holds_show_the_noise_around_a_creep(correlation: float) -> None:
     v, creep = held_levels()
-    found = holds(record(v, creep + noise(v.size, correlation)))
-    assert found is not None
-    assert found.count == 4
-    assert found.level == pytest.approx(LEVEL, rel=0.05)
-    assert found.autocovariance[1] / found.autocovariance[0] == pytest.approx(correlation, abs=0.05)
+    result = holds(record(v, creep + noise(v.size, correlation)))
+    assert result is not None
+    assert result.count == 4
+    assert result.level == pytest.approx(LEVEL, rel=0.05)
+    assert result.autocovariance[1] / result.autocovariance[0] == pytest.approx(
+        correlation, abs=0.05
+    )
 
 
 def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:
@@ -131,9 +135,9 @@ def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:
     since = STEP * (np.arange(n) % step)
     ringing = 30 * LEVEL * np.exp(-0.02 * omega * since) * np.cos(omega * since)
     levels = np.where(np.arange(n) // step % 2, 10.0, 0.0)
-    found = holds(record(levels, np.asarray(ringing + noise(n, 0.0), np.float64)))
-    assert found is not None
-    assert found.level == pytest.approx(LEVEL, rel=0.25)
+    result = holds(record(levels, np.asarray(ringing + noise(n, 0.0), np.float64)))
+    assert result is not None
+    assert result.level == pytest.approx(LEVEL, rel=0.25)
 
 
 def test_held_spans_are_no_ramps() -> None:

@@ -91,12 +91,12 @@ def test_what_is_not_held_out_is_told() -> None:
 def test_what_is_held_out_but_not_fitted_is_told() -> None:
     """Slow and wide loops are held out; their first tenth, which tells their start, too."""
     small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
-    found = texts(coverage_notes(divided([record(small)], [record(slow)])))
-    assert len(found) == 3
-    assert "large falls of 0.25 to 1 s" in found[0]
-    assert "extrapolates" in found[0]
-    assert "says nothing" in found[1]
-    assert "from 0 to 50 V, fitted ones from 0 to 10 V" in found[2]
+    result = texts(coverage_notes(divided([record(small)], [record(slow)])))
+    assert len(result) == 3
+    assert "large falls of 0.25 to 1 s" in result[0]
+    assert "extrapolates" in result[0]
+    assert "says nothing" in result[1]
+    assert "from 0 to 50 V, fitted ones from 0 to 10 V" in result[2]
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -102,10 +102,10 @@ def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int)
     for start in range(60, T.size - 60, 97):
         spikes[start : start + width] = True
         y[start : start + width] += draw.choice([-1, 1]) * draw.uniform(0.03, 0.6) * RANGE
-    found = suspects(replace(base, displacement=y))
-    assert (found.mask & spikes).sum() > 0.9 * spikes.sum()
-    assert (found.mask & ~spikes).sum() <= 1
-    assert found.counts["outlier"] == found.mask.sum()
+    result = suspects(replace(base, displacement=y))
+    assert (result.mask & spikes).sum() > 0.9 * spikes.sum()
+    assert (result.mask & ~spikes).sum() <= 1
+    assert result.counts["outlier"] == result.mask.sum()
 
 
 @pytest.mark.parametrize("value", [0.0, 1.4 * RANGE, -0.3 * RANGE])
@@ -118,11 +118,11 @@ def test_drop_outs_are_found(value: float, length: int) -> None:
     for start in starts:
         lost[start : start + length] = True
     y[lost] = value
-    found = suspects(replace(base, displacement=y))
+    result = suspects(replace(base, displacement=y))
     assert len(starts) >= 4
-    np.testing.assert_array_equal(found.mask, lost)
-    assert found.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0, "saturated": 0}
-    (sentence,) = texts(found.notes("a.csv"))
+    np.testing.assert_array_equal(result.mask, lost)
+    assert result.counts == {"outlier": 0, "drop-out": lost.sum(), "stuck": 0, "saturated": 0}
+    (sentence,) = texts(result.notes("a.csv"))
     assert sentence.startswith(f"a.csv: {lost.sum()} samples belong to drop-outs")
 
 
@@ -131,9 +131,9 @@ def test_a_stuck_sensor_is_found(noise: str) -> None:
     base = record("sine", noise)
     y = np.array(base.displacement)
     y[3300:3700] = y[3299]
-    found = suspects(replace(base, displacement=y))
-    assert found.counts["stuck"] >= 399
-    assert set(np.flatnonzero(found.mask)) <= set(range(3295, 3702))
+    result = suspects(replace(base, displacement=y))
+    assert result.counts["stuck"] >= 399
+    assert set(np.flatnonzero(result.mask)) <= set(range(3295, 3702))
 
 
 def test_cleaned_masks_and_makes_nothing_up() -> None:
@@ -164,11 +164,11 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert quantum_of(np.round(motion, 10)) is None
     assert quantum_of(np.repeat(draw.standard_normal(50), 100)) is None
     assert quantum_of(np.where(T < 0.5, 0.0, 1.0)) is None
-    found = suspects(record("sine", "coarse steps"))
-    assert found.quantum == pytest.approx(STEP["coarse steps"])
-    assert texts(found.notes("r")) == ("r: the displacement is quantised in steps of 400 nm.",)
+    result = suspects(record("sine", "coarse steps"))
+    assert result.quantum == pytest.approx(STEP["coarse steps"])
+    assert texts(result.notes("r")) == ("r: the displacement is quantised in steps of 400 nm.",)
     counts = np.round(np.asarray(record("sine", "white").displacement) / 1e-7)
-    found = suspects(
+    result = suspects(
         Record(
             name="c",
             time=T,
@@ -177,24 +177,24 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
             displacement_unit="counts",
         )
     )
-    assert texts(found.notes("c")) == ("c: the displacement is quantised in steps of 1 counts.",)
+    assert texts(result.notes("c")) == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
 def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:
     """The next reading makes up for what was missed; a stack that always answers late is none."""
-    given = record("triangle", "white")
-    y = np.array(given.displacement)
-    per_sample = 0.01 * RANGE * float(np.max(np.abs(np.diff(given.voltage))))
+    inputs = record("triangle", "white")
+    y = np.array(inputs.displacement)
+    per_sample = 0.01 * RANGE * float(np.max(np.abs(np.diff(inputs.voltage))))
     repeats = int(np.ceil(1e-2 * RANGE / per_sample))
     expected = set[int]()
     for k in (300, 460, 777):
         y[k : k + repeats] = y[k - 1]
         expected |= set(range(k, k + repeats))
-    found = suspects(replace(given, displacement=y))
-    assert set(np.flatnonzero(found.mask).tolist()) == expected
-    assert found.counts["stuck"] == len(expected)
+    result = suspects(replace(inputs, displacement=y))
+    assert set(np.flatnonzero(result.mask).tolist()) == expected
+    assert result.counts["stuck"] == len(expected)
     slow = np.repeat(y[::4], 4)[: y.size]  # a sensor that is read every fourth sample only
-    assert suspects(replace(given, displacement=slow)).counts["stuck"] == 0
+    assert suspects(replace(inputs, displacement=slow)).counts["stuck"] == 0
 
 
 @pytest.mark.parametrize("noise", ["white", "loud"])
@@ -203,15 +203,15 @@ def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
     noise: str, digit: float
 ) -> None:
     """However slowly the stack moves; what the file's digits repeat by chance is left alone."""
-    given = record("sine", noise)
-    y = np.array(given.displacement)
+    inputs = record("sine", noise)
+    y = np.array(inputs.displacement)
     y = np.round(y / (digit * RANGE)) * (digit * RANGE) if digit else y
-    assert not suspects(replace(given, displacement=y)).mask.any()
+    assert not suspects(replace(inputs, displacement=y)).mask.any()
     places = np.random.default_rng(2).choice(y.size - 9, 60, replace=False) + 5
     for k in np.sort(places):
         y[k] = y[k - 1]
-    found = suspects(replace(given, displacement=y))
-    assert set(places.tolist()) <= set(np.flatnonzero(found.mask).tolist())
-    assert found.counts["stuck"] == int(found.mask.sum()) < 1.1 * places.size + 10
+    result = suspects(replace(inputs, displacement=y))
+    assert set(places.tolist()) <= set(np.flatnonzero(result.mask).tolist())
+    assert result.counts["stuck"] == int(result.mask.sum()) < 1.1 * places.size + 10
     coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
-    assert suspects(replace(given, displacement=coarse)).counts["stuck"] == 0
+    assert suspects(replace(inputs, displacement=coarse)).counts["stuck"] == 0

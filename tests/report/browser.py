@@ -90,10 +90,10 @@ def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool 
     copy.write_text(text, encoding="utf-8")
     document, console = browser.document(copy, *flags)
     copy.unlink()
-    found = re.search(r"<pre id=.driven.>(.*?)</pre>", document, re.DOTALL)
-    if found is None or not found[1] or (silent and console):
+    result = re.search(r"<pre id=.driven.>(.*?)</pre>", document, re.DOTALL)
+    if result is None or not result[1] or (silent and console):
         pytest.fail(f"the script in {page} did not come to its end: {console}")
-    return json.loads(unescape(found[1]))
+    return json.loads(unescape(result[1]))
 
 
 def find_browser(folder: Path) -> Browser:
@@ -111,8 +111,8 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     """Return a page that shows `page` in a frame as wide as a phone."""
     inner, outer = (page.with_name(f"{page.stem}-{part}.html") for part in ("inner", "phone"))
     text = without_policy(page.read_text(encoding="utf-8"))
-    told = f"<script>{script('phone')}</script></body>"
-    inner.write_text(text.replace("</body>", told), encoding="utf-8")
+    output = f"<script>{script('phone')}</script></body>"
+    inner.write_text(text.replace("</body>", output), encoding="utf-8")
     outer.write_text(
         "<!DOCTYPE html><html><body style='margin:0'>"
         f"<iframe src='{inner.name}' width='{PHONE}' height='{height}' style='border:0'></iframe>"
@@ -125,5 +125,5 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
 def seen_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
     """Return how a page came out on a phone."""
     hear = "addEventListener('message', function (e) { tell(JSON.parse(e.data)); });"
-    found: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)
-    return found
+    table: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)
+    return table

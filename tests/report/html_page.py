@@ -31,9 +31,9 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self._open.append(tag)
-        given = {k: v or "" for k, v in attrs}
-        self.names.add(given.get("id", ""))
-        links = [v for k, v in given.items() if k in ("src", "href", "srcset", "data")]
+        table = {k: v or "" for k, v in attrs}
+        self.names.add(table.get("id", ""))
+        links = [v for k, v in table.items() if k in ("src", "href", "srcset", "data")]
         self.targets |= {link[1:] for link in links if link.startswith("#")}
         self.loaded += [link for link in links if not link.startswith(("#", "data:image/png;"))]
 

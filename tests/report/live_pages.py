@@ -39,13 +39,13 @@ def run_in_browser(
 
     Each is run so many `times` more, and `spent` is what one takes then [ms].
     """
-    given = {"model": live_data(model, web_module(model)), "cases": list(cases), "times": times}
+    table = {"model": live_data(model, web_module(model)), "cases": list(cases), "times": times}
     page = browser.folder / "module.html"
     scripts = "".join(map(library, ("packed.js", "live_model.js")))
     page.write_text(f"<html><body><script>{scripts}</script></body></html>", encoding="utf-8")
-    told = driven(browser, page, f"var given = {json.dumps(given)};\n{script('module')}")
-    assert isinstance(told, list), told
-    for row in told:
+    output = driven(browser, page, f"var given = {json.dumps(table)};\n{script('module')}")
+    assert isinstance(output, list), output
+    for row in output:
         if "shown" in row:
             row["shown"] = np.frombuffer(base64.b64decode(row["shown"]), "<f8")
-    return told
+    return output

@@ -113,7 +113,7 @@ def diagnosis(
     errors = Errors(4e-8, 5e-8, 1.5e-7, 0.31)
     removes = Share("slow_creep", 0.97 if added else 0.0, (0.95, 0.98) if added else (0.0, 0.0))
     left = (7e-9, 0.04) if added else (4.97e-8, 0.31)
-    seen = [misfits(n, samples) for n in names]
+    items = [misfits(n, samples) for n in names]
     return result.StackDiagnosis(
         verdict=verdict,
         causes=(cause,) if added else (),
@@ -143,9 +143,9 @@ def diagnosis(
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,
-        noise=tuple(s[0] for s in seen),
-        misfit=tuple(s[1] for s in seen),
-        remainder=tuple(s[2] if added else s[1] for s in seen),
+        noise=tuple(s[0] for s in items),
+        misfit=tuple(s[1] for s in items),
+        remainder=tuple(s[2] if added else s[1] for s in items),
     )
 
 

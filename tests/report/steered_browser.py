@@ -42,16 +42,16 @@ class Steered:
 
     def call(self, method: str, **given: Any) -> dict[str, Any]:
         self._count += 1
-        asked = {"id": self._count, "method": method, "params": given, **(self._session or {})}
-        os.write(self._write, json.dumps(asked).encode() + b"\0")
+        table = {"id": self._count, "method": method, "params": given, **(self._session or {})}
+        os.write(self._write, json.dumps(table).encode() + b"\0")
         while True:
-            told = self._next()
-            if told.get("id") == self._count:
-                if "error" in told:
-                    raise RefusedError(told["error"])
-                found: dict[str, Any] = told["result"]
-                return found
-            self.heard.append(told)
+            output = self._next()
+            if output.get("id") == self._count:
+                if "error" in output:
+                    raise RefusedError(output["error"])
+                result: dict[str, Any] = output["result"]
+                return result
+            self.heard.append(output)
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
@@ -59,22 +59,22 @@ class Steered:
             assert block, "the browser has gone"
             self._rest += block
         row, self._rest = self._rest.split(b"\0", 1)
-        found: dict[str, Any] = json.loads(row)
-        return found
+        table: dict[str, Any] = json.loads(row)
+        return table
 
     def run(self, script: str) -> Any:
         """Return what an expression is worth in the page."""
-        found = self.call("Runtime.evaluate", expression=script, returnByValue=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        result = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
 
     def until(self, script: str, limit: float = 20.0) -> None:
         """Wait until an expression is true in the page."""
-        end, found = time.monotonic() + limit, False
-        while not found:
+        end, result = time.monotonic() + limit, False
+        while not result:
             with suppress(RefusedError):
-                found = self.run(f"Boolean({script})")
-            if not found:
+                result = self.run(f"Boolean({script})")
+            if not result:
                 assert time.monotonic() < end, (script, self.run("document.body.innerText"))
                 time.sleep(0.1)
 

@@ -52,26 +52,26 @@ def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
     """Return the held-out rms [nm] of the first record at other values, the offset found again."""
     e, fit = d.experiments[0], d.extended_fit
     model = d.model.with_values(values)
-    found = psa.simulate_record(
+    trajectory = psa.simulate_record(
         model, e.record, fit.unknowns.start(fit.theta, 0), as_exported=False
     )
-    residual = measured(e.record) - found.displacement
-    seen, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
-    use = seen & ~e.held_out
+    residual = measured(e.record) - trajectory.displacement
+    observed, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
+    use = observed & ~e.held_out
     residual += np.mean(center[use]) - np.mean(residual[use])
-    return 1e9 * float(np.sqrt(np.mean(residual[seen & e.held_out] ** 2)))
+    return 1e9 * float(np.sqrt(np.mean(residual[observed & e.held_out] ** 2)))
 
 
 @pytest.fixture(scope="module")
 def moved(browser: Browser, page: Path) -> dict[str, Any]:
-    found: dict[str, Any] = driven(browser, page, script("live"), DARK)
-    return found
+    table: dict[str, Any] = driven(browser, page, script("live"), DARK)
+    return table
 
 
 def told_rms(text: str) -> float:
-    found = re.search(r"held-out samples: ([\d.e+-]+) (nm|µm) rms", text)
-    assert found is not None, text
-    return float(found[1]) * (1e3 if found[2] == "µm" else 1.0)
+    result = re.search(r"held-out samples: ([\d.e+-]+) (nm|µm) rms", text)
+    assert result is not None, text
+    return float(result[1]) * (1e3 if result[2] == "µm" else 1.0)
 
 
 @slow
@@ -127,16 +127,16 @@ def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
 ) -> None:
     model = shown.model.with_values({"creep_gain": 0.02})
     psa.write_report(replace(shown, model=model), tmp_path / "on.html")
-    said = driven(browser, tmp_path / "on.html", """
+    statement = driven(browser, tmp_path / "on.html", """
       var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
       box.psa.set('creep_gain', 0);
       tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
-    assert "nothing is fitted again" not in said[0]
-    assert "With slow creep off nothing is fitted again: all other values were" in said[1]
+    assert "nothing is fitted again" not in statement[0]
+    assert "With slow creep off nothing is fitted again: all other values were" in statement[1]
     e = shown.experiments[0]
     miss = (measured(e.record) - shown.base[0])[e.held_out & np.isfinite(measured(e.record))]
     base = 1e9 * float(np.sqrt(np.mean(miss**2)))
-    assert f"The base model, fitted without any effect, leaves {base:.3g} nm." in said[1]
+    assert f"The base model, fitted without any effect, leaves {base:.3g} nm." in statement[1]
 
 
 @slow
@@ -178,16 +178,16 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
     write_design_page(
         tmp_path / "d.html", title="A design", summary=["It moves."], live=played_again
     )
-    said = driven(browser, tmp_path / "d.html", """
+    statement = driven(browser, tmp_path / "d.html", """
       var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
       box.psa.set('k_L', 8);
       tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
-    assert said[0].startswith("Off the path by 50 nm rms")
+    assert statement[0].startswith("Off the path by 50 nm rms")
     changed = respond(model.with_values({"k_L": 8.0}), t, played.voltage).displacement
     off = 1e9 * float(np.sqrt(np.mean((path - changed) ** 2)))
-    found = re.search(r"by ([\d.]+) (nm|µm) rms", said[1])
-    assert found is not None
-    assert float(found[1]) * (1e3 if found[2] == "µm" else 1.0) == pytest.approx(off, rel=6e-3)
+    result = re.search(r"by ([\d.]+) (nm|µm) rms", statement[1])
+    assert result is not None
+    assert float(result[1]) * (1e3 if result[2] == "µm" else 1.0) == pytest.approx(off, rel=6e-3)
 
 
 @slow
@@ -209,12 +209,12 @@ def test_what_json_cannot_hold_stays_out_of_a_page() -> None:
     )  # fmt: skip
     sure = Provenance(intervals={"k_L": Interval(1.0, math.inf), "tau": Interval(1e-5, 1e-3)})
     model = psa.stack_model("P-885.51").with_effect(free).with_values({}, provenance=sure)
-    told = {p["name"]: p for p in live_data(model, b"")["parameters"]}
-    json.dumps(told, allow_nan=False)
-    assert told["k_L"]["interval"] is None
-    assert told["tau"]["interval"] == [1e-5, 1e-3]
-    assert told["g"]["ends"] == [-8.0, 8.0]
-    low, high = told["k_L"]["ends"]
+    table = {p["name"]: p for p in live_data(model, b"")["parameters"]}
+    json.dumps(table, allow_nan=False)
+    assert table["k_L"]["interval"] is None
+    assert table["tau"]["interval"] == [1e-5, 1e-3]
+    assert table["g"]["ends"] == [-8.0, 8.0]
+    low, high = table["k_L"]["ends"]
     assert low < model.values["k_L"] < high
 
 
@@ -237,30 +237,30 @@ def test_a_model_of_ones_own_runs_in_its_page(
 ) -> None:
     """Every output of a record beside the model, at values that are moved, as Python has them."""
     record = plants.motor(1, friction=0.0)
-    found = psa.identify(own_models.motor(), record, starts=1)
-    psa.write_fit_report(found, tmp_path / "page.html")
+    result = psa.identify(own_models.motor(), record, starts=1)
+    psa.write_fit_report(result, tmp_path / "page.html")
     script = (
         "var box = document.querySelector('.live'), list = box.querySelector('select');"
         "function text() { return box.querySelector('output').textContent; }"
         "var rows = Array.prototype.map.call(list.options, function (o) {"
         "  list.value = o.value; list.dispatchEvent(new Event('change'));"
-        f"  box.psa.set('R', {1.1 * found.model.values['R']!r});"
+        f"  box.psa.set('R', {1.1 * result.model.values['R']!r});"
         "  return [o.textContent, text(), box.querySelector('figcaption').textContent]; });"
         "tell(rows);"
     )
     rows = driven(browser, tmp_path / "page.html", script)
-    model = found.model.with_values({"R": 1.1 * found.model.values["R"]})
+    model = result.model.with_values({"R": 1.1 * result.model.values["R"]})
     time, u = record.time - record.time[0], record.columns["voltage"][:, None]
-    x0 = np.array([found.fit.start(0).get(s.name, 0.0) for s in model.structure.states])
+    x0 = np.array([result.fit.start(0).get(s.name, 0.0) for s in model.structure.states])
     y = dict(zip(model.output_names, psa.run(model, time, u, x0).y.T, strict=True))
     assert {row[2] for row in rows} == {"w over time", "i over time"}
     for _, text, caption in rows:
         name = caption.split()[0]
-        told = re.search(r"^Error: ([\d.e+-]+) (m?)", text)
-        assert told is not None, text
-        missed = float(np.sqrt(np.mean((record.columns[name] - y[name]) ** 2)))
-        assert float(told[1]) * (1e-3 if told[2] else 1.0) == pytest.approx(missed, rel=6e-3)
-    psa.write_fit_report(found, tmp_path / "still.html", still=True)
+        output = re.search(r"^Error: ([\d.e+-]+) (m?)", text)
+        assert output is not None, text
+        misfit = float(np.sqrt(np.mean((record.columns[name] - y[name]) ** 2)))
+        assert float(output[1]) * (1e-3 if output[2] else 1.0) == pytest.approx(misfit, rel=6e-3)
+    psa.write_fit_report(result, tmp_path / "still.html", still=True)
     assert "Change the model and see" not in (tmp_path / "still.html").read_text("utf-8")
     monkeypatch.setattr(Model, "sampled_names", ("held",))
-    assert "sampled states" in LiveModel(found.model, Future(), []).cure()
+    assert "sampled states" in LiveModel(result.model, Future(), []).cure()

@@ -22,13 +22,13 @@ from psa_casadi.examples.index import examples
 
 def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:
     """Return the options of every command below a group."""
-    found: dict[str, list[str]] = {}
+    table: dict[str, list[str]] = {}
     for word, command in group.commands.items():
         if isinstance(command, TyperGroup):
-            found |= _options(command, f"{name} {word}")
+            table |= _options(command, f"{name} {word}")
         else:
-            found[f"{name} {word}"] = [o for p in command.params for o in p.opts if o[:2] == "--"]
-    return found
+            table[f"{name} {word}"] = [o for p in command.params for o in p.opts if o[:2] == "--"]
+    return table
 
 
 def test_the_page_of_commands_holds_every_command_and_option() -> None:
@@ -37,15 +37,15 @@ def test_the_page_of_commands_holds_every_command_and_option() -> None:
     parts = dict(part.split("`\n", 1) for part in commands().split("# `")[1:])
     options = _options(group, "psa")
     assert len(options) >= 15
-    for name, given in options.items():
+    for name, inputs in options.items():
         lines = [line for line in parts[name].splitlines() if line.startswith("* `")]
-        assert [o for o in given if not any(o in line for line in lines)] == [], name
+        assert [o for o in inputs if not any(o in line for line in lines)] == [], name
     assert "Example: `psa demo my_demo`" in parts["psa demo"]
 
 
 def test_the_gallery_lists_every_effect() -> None:
-    shown = [row[0].replace("<wbr>", "") for row in overview().rows]
-    assert shown == [f"[<code>{name}</code>](#{name})" for name in psa.EFFECTS]
+    items = [row[0].replace("<wbr>", "") for row in overview().rows]
+    assert items == [f"[<code>{name}</code>](#{name})" for name in psa.EFFECTS]
 
 
 def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:

@@ -28,10 +28,10 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
     token = typed.set("psa diagnose 'my record.csv'")
     try:
-        d, found = diagnosis("cause_named"), identification()
+        d, result = diagnosis("cause_named"), identification()
         paths = [tmp_path / f"{k}.html" for k in range(3)]
         psa.write_report(d, paths[0], still=True)
-        psa.write_fit_report(found, paths[1], still=True)
+        psa.write_fit_report(result, paths[1], still=True)
         write_design_page(paths[2], title="A design", summary=["It moves."])
     finally:
         typed.reset(token)
@@ -39,7 +39,7 @@ def test_every_page_tells_date_version_command_and_the_records_hashes(
         text = Page(path.read_text(encoding="utf-8")).text
         assert f"Written 2026-09-21 14:13 UTC by psa_casadi {psa.__version__}." in text
         assert "Command: psa diagnose 'my record.csv'" in text
-    for path, experiments in zip(paths, (d.experiments, found.experiments), strict=False):
+    for path, experiments in zip(paths, (d.experiments, result.experiments), strict=False):
         for e in experiments:
             assert e.record.sha256 in path.read_text(encoding="utf-8")
 
@@ -62,24 +62,24 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
 
 def _said() -> list[tuple[str, set[str]]]:
     """Return the code and the names of the values of every note in the package."""
-    found = []
+    items = []
     for path in Path(psa_casadi.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "note":
                 names = {k.arg for k in node.keywords if k.arg}
                 codes = [c for c in ast.walk(node.args[0]) if isinstance(c, ast.Constant)]
-                found += [(c.value, names) for c in codes if isinstance(c.value, str)]
-    return found
+                items += [(c.value, names) for c in codes if isinstance(c.value, str)]
+    return items
 
 
 def test_every_note_has_a_sentence_that_takes_its_values() -> None:
-    said = _said()
-    assert len(said) > 40
-    for code, names in said:
+    statement = _said()
+    assert len(statement) > 40
+    for code, names in statement:
         sentence = SENTENCES[code]
         if isinstance(sentence, str):
-            asked = {field for _, field, _, _ in Formatter().parse(sentence) if field}
-            assert asked <= names, code
+            requested = {field for _, field, _, _ in Formatter().parse(sentence) if field}
+            assert requested <= names, code
         else:
             assert set(signature(sentence).parameters) == names, code
 
@@ -88,8 +88,8 @@ def test_values_have_their_units_and_names_stand_in_a_row() -> None:
     assert str(note("noise_repeats", apart=(0.02, "s"))).endswith("returns after 20 ms")
     assert str(note("little", least=0.7, more=True)) == "that is less than 70 % and much remains"
     assert str(note("little", least=0.05, more=False)) == "that is less than 5 %"
-    said = str(note("vague", names=("a", "b"), why=note("no_such_voltage")))
-    assert said.startswith("a, b: in the extended model and not named: no stack bears")
+    statement = str(note("vague", names=("a", "b"), why=note("no_such_voltage")))
+    assert statement.startswith("a, b: in the extended model and not named: no stack bears")
     assert str(note("same_curve", effects=("a", "b", "c"))).startswith("a and b and c bend")
 
 
@@ -106,5 +106,5 @@ def test_a_row_of_stated_probabilities_counts_the_effects_it_names() -> None:
         r"^\| .*, (\d+) effects: mean, right \|(.*)$", EVIDENCE.read_text("utf-8"), re.M
     )
     assert len(rows) == 3
-    for told, cells in rows:
-        assert sum(int(n) for n in re.findall(r"of (\d+) \|", cells)) == int(told)
+    for output, cells in rows:
+        assert sum(int(n) for n in re.findall(r"of (\d+) \|", cells)) == int(output)

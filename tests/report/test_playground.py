@@ -34,8 +34,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def played(browser: Browser, page: Path) -> dict[str, Any]:
-    found: dict[str, Any] = driven(browser, page, script("playground"), "--window-size=1200,2000")
-    return found
+    table: dict[str, Any] = driven(browser, page, script("playground"), "--window-size=1200,2000")
+    return table
 
 
 @slow
@@ -56,8 +56,8 @@ def test_what_it_downloads_is_what_python_simulates(played: dict[str, Any]) -> N
     gain = model.parameter("creep_gain").typical(model.values)
     model = model.with_values({"creep_gain": gain})
     wanted = psa.simulate(model, t, v).displacement
-    shown = table[:, head.index("measured_displacement [m]")]
-    assert np.max(np.abs(shown - wanted)) < 2e-6 * np.ptp(wanted)
+    displayed = table[:, head.index("measured_displacement [m]")]
+    assert np.max(np.abs(displayed - wanted)) < 2e-6 * np.ptp(wanted)
 
 
 @slow
@@ -78,9 +78,9 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     assert model.values["creep_gain"] > 0.0
     described = {v.name: v for v in fmpy.read_model_description(folder).modelVariables}
     assert {n: float(described[n].start) for n in model.values} == model.values
-    told = {v.name: v.nominal for v in variable_table(model)}
+    table = {v.name: v.nominal for v in variable_table(model)}
     assert [float(described[n].nominal) for n in model.state_names] == [
-        told[n] for n in model.state_names
+        table[n] for n in model.state_names
     ]
     others = {c.gain for c in psa.EFFECTS.values()} - {"creep_gain"}
     assert {float(described[gain].start) for gain in others if gain} == {0.0}
@@ -95,13 +95,13 @@ def test_the_fmu_that_it_downloads_is_the_model_with_these_values(
     shutil.move(folder / "sources" / line[-1], binaries)
     t = np.linspace(0.0, 4e-3, 401)
     v = 100.0 * np.where((t > 2e-4) & (t < 3.5e-3), 1.0 - np.cos(2.0 * np.pi * t / 2e-3), 0.0)
-    found = fmpy.simulate_fmu(
+    result = fmpy.simulate_fmu(
         folder, fmi_type="CoSimulation", stop_time=t[-1], output_interval=t[1],
         relative_tolerance=1e-8,
         input=np.array(list(zip(t, v, strict=True)), [("time", float), ("voltage", float)]),
     )  # fmt: skip
     wanted = psa.simulate(model, t, v, rtol=1e-9, hold="zero").displacement
-    assert np.max(np.abs(found["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
+    assert np.max(np.abs(result["measured_displacement"] - wanted)) < 1e-7 * np.ptp(wanted)
 
 
 @slow
@@ -116,9 +116,9 @@ def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
 @slow
 def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) -> None:
     assert "add up to 0 nm" in played["plain"]
-    said = [played[k] for k in ("plain", "effect", "other", "drawn")]
-    assert len(set(said)) == 4
-    assert all(s.startswith("Stroke ") for s in said)
+    items = [played[k] for k in ("plain", "effect", "other", "drawn")]
+    assert len(set(items)) == 4
+    assert all(s.startswith("Stroke ") for s in items)
     assert played["knobs"] == len(psa.EFFECTS["slow_creep"].parameters)
     assert list(played["corners"].values()) == [0.0, 50.0, 100.0, 75.0, 50.0]
     assert list(played["read"]["t"].values()) == pytest.approx([0.0, 1e-3, 2e-3, 3.5e-3])
@@ -128,8 +128,8 @@ def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) ->
 
 @slow
 def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[str, Any]) -> None:
-    said = "The voltage reaches 900 V; P-885.51 is rated for 120 V."
-    assert played["beyond"].startswith(said)
+    text = "The voltage reaches 900 V; P-885.51 is rated for 120 V."
+    assert played["beyond"].startswith(text)
     assert played["within"]
     even = {k: list(played["even"][k].values()) for k in ("t", "v")}
     assert even["t"] == pytest.approx(np.linspace(0.0, 19.19, 20))
@@ -139,10 +139,10 @@ def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[s
 
 @slow
 def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> None:
-    found = seen_on_a_phone(browser, page)
-    assert found["outside"] == []
-    assert found["needed"] == found["width"]
-    assert found["smallest"] >= 9
+    table = seen_on_a_phone(browser, page)
+    assert table["outside"] == []
+    assert table["needed"] == table["width"]
+    assert table["smallest"] >= 9
     assert browser.serious_faults(page) == []
 
 

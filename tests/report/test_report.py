@@ -111,8 +111,8 @@ LONG = [(1, 1_000_000), (20, 5_000)]
 def test_long_and_many_records_stay_below_1_5_mb_and_keep_their_spikes(
     records: int, samples: int
 ) -> None:
-    found, rows = long_fit(records, samples)
-    page = results.fit_page(found, rows)
+    result, rows = long_fit(records, samples)
+    page = results.fit_page(result, rows)
     assert len(page.encode()) < 3e6
     drawn = figures(page)[2:]
     assert len(drawn) == 7 * min(records, results.MOST_RECORDS)
@@ -121,12 +121,12 @@ def test_long_and_many_records_stay_below_1_5_mb_and_keep_their_spikes(
     assert all(words.count(s.name) >= 2 for s in rows)
     pictured = [s for s in rows if f"{s.name} (measured)" in words]
     for figure, s in zip(drawn[::7], pictured, strict=True):
-        shown, model, residual = (numbers(t["y"]) for t in figure["data"])
+        displayed, model, residual = (numbers(t["y"]) for t in figure["data"])
         whole = s.scale.factor * s.measured
-        assert np.nanmax(shown) == pytest.approx(np.nanmax(whole), rel=1e-6)
-        assert np.nanmin(shown) == pytest.approx(np.nanmin(whole), rel=1e-6)
+        assert np.nanmax(displayed) == pytest.approx(np.nanmax(whole), rel=1e-6)
+        assert np.nanmin(displayed) == pytest.approx(np.nanmin(whole), rel=1e-6)
         assert np.nanmax(residual) == pytest.approx(3.0, rel=0.01)
-        assert np.isnan(shown).any()
+        assert np.isnan(displayed).any()
         assert np.isfinite(model).all()
 
 
@@ -135,16 +135,16 @@ def test_every_column_of_pixels_keeps_its_extremes() -> None:
     signals = [rng.standard_normal(1_000_000), rng.standard_normal(1_000_000)]
     signals[0][777], signals[1][900_000], signals[0][5] = 50.0, -60.0, np.nan
     signals[1][250_000:260_000] = np.nan
-    shown = series.kept(signals, 4000)
-    assert len(shown) <= 4002
-    assert np.all(np.diff(shown) > 0)
-    assert (shown[0], shown[-1]) == (0, 999_999)
-    starts = np.searchsorted(shown, 1000 * np.arange(1000))
+    displayed = series.kept(signals, 4000)
+    assert len(displayed) <= 4002
+    assert np.all(np.diff(displayed) > 0)
+    assert (displayed[0], displayed[-1]) == (0, 999_999)
+    starts = np.searchsorted(displayed, 1000 * np.arange(1000))
     for values in signals:
         for extreme in (np.fmax, np.fmin):  # NaN where a whole column is
             whole = extreme.reduce(values.reshape(1000, 1000), axis=1)
-            np.testing.assert_array_equal(extreme.reduceat(values[shown], starts), whole)
-    assert {777, 900_000} <= set(shown.tolist())
+            np.testing.assert_array_equal(extreme.reduceat(values[displayed], starts), whole)
+    assert {777, 900_000} <= set(displayed.tolist())
 
 
 def test_a_short_record_is_drawn_whole_and_a_gap_stays_a_gap() -> None:
@@ -210,11 +210,11 @@ _SKEWED, _HEAVY = _RNG.exponential(size=20_000) - 1.0, _RNG.laplace(size=20_000)
 def test_a_residual_is_called_what_it_is(
     residual: FloatArray, figure: str, wanted: tuple[float, float], said: str
 ) -> None:
-    found = figures_of(residual)
-    assert getattr(found, figure) == pytest.approx(wanted[0], abs=wanted[1])
-    sentence = residual_sentence(found, "base model", Scale("s", 1.0))
+    result = figures_of(residual)
+    assert getattr(result, figure) == pytest.approx(wanted[0], abs=wanted[1])
+    sentence = residual_sentence(result, "base model", Scale("s", 1.0))
     assert said in sentence
-    assert figure != "lasting" or f"that of noise after {found.lasting:.2f} s" in sentence
+    assert figure != "lasting" or f"that of noise after {result.lasting:.2f} s" in sentence
 
 
 def test_a_residual_can_be_read_beside_one_that_is_far_off() -> None:
@@ -238,10 +238,10 @@ def test_a_spectrum_of_many_lines_is_thinned_and_keeps_its_peaks() -> None:
     time = np.arange(1_000_000) / 100_000.0
     residual = white(len(time)) + np.sin(2 * np.pi * 20_000.0 * time)
     frequency, density = series.spectrum(time, residual)
-    shown = series.shown_lines(frequency, density, 800)
+    indices = series.shown_lines(frequency, density, 800)
     assert len(frequency) > 50_000
-    assert len(shown) <= 810
+    assert len(indices) <= 810
     peak = int(np.argmax(density))
-    assert peak in shown
+    assert peak in indices
     assert frequency[peak] == pytest.approx(20_000.0, rel=1e-3)
-    assert (shown[0], shown[-1]) == (0, len(frequency) - 1)
+    assert (indices[0], indices[-1]) == (0, len(frequency) - 1)

@@ -34,8 +34,8 @@ def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _written(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
-        found = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
-        write_fit_report(found, path, origin="synthetic")
+        result = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
+        write_fit_report(result, path, origin="synthetic")
     else:
         write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
     return path
@@ -83,20 +83,20 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
     broken.write_text(f"<html><body>{wide}{tiny}{script}</body></html>", encoding="utf-8")
     with pytest.raises(pytest.fail.Exception, match=r"by hand.*Uncaught ReferenceError"):
         seen_on_a_phone(browser, broken)
-    found = seen_on_a_phone(browser, broken, silent=False)
-    assert found["needed"] > PHONE
-    assert found["outside"] == ["DIV.drawing"]
-    assert found["small"] == ["tiny"]
+    table = seen_on_a_phone(browser, broken, silent=False)
+    assert table["needed"] > PHONE
+    assert table["outside"] == ["DIV.drawing"]
+    assert table["small"] == ["tiny"]
 
 
 @slow
 def test_a_phone_shows_it_legibly_without_scrolling_sideways(browser: Browser, page: Path) -> None:
-    told = seen_on_a_phone(browser, page)
-    assert told["width"] == told["needed"] == PHONE
-    assert told["outside"] == told["small"] == []
-    assert told["drawn"] == told["plots"] >= 14
-    assert told["narrowest"] > 0.9 * PHONE
-    assert told["smallest"] >= 9
+    table = seen_on_a_phone(browser, page)
+    assert table["width"] == table["needed"] == PHONE
+    assert table["outside"] == table["small"] == []
+    assert table["drawn"] == table["plots"] >= 14
+    assert table["narrowest"] > 0.9 * PHONE
+    assert table["smallest"] >= 9
 
 
 @slow

@@ -27,8 +27,8 @@ from tests.report.report_cases import diagnosis, identification, with_periodic
 
 def shipped(name: str) -> dict[str, Any]:
     text = (files("psa_casadi") / "data" / "schemas" / f"{name}.schema.json").read_text("utf-8")
-    found: dict[str, Any] = json.loads(text)
-    return found
+    table: dict[str, Any] = json.loads(text)
+    return table
 
 
 def valid(name: str, text: str) -> dict[str, Any]:
@@ -57,8 +57,8 @@ def test_model_files_are_as_their_schema_says(name: str) -> None:
 @pytest.mark.parametrize("make", [oscillator, motor, tanks, pair, cylinder, oven])
 def test_files_of_own_models_are_as_their_schema_says(make: Any) -> None:
     content = valid("model", dumps(with_ports(make())))
-    (own,) = content["own"].values()
-    assert own["ports"]
+    (item,) = content["own"].values()
+    assert item["ports"]
 
 
 def test_the_evidence_of_a_model_is_as_its_schema_says() -> None:
@@ -80,17 +80,22 @@ def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
 
 
 def test_identifications_are_as_their_schema_says() -> None:
-    found = identification()
-    k = found.determinacy.names[0]
+    stack_identification = identification()
+    k = stack_identification.determinacy.names[0]
     profile = Profile(k, "N/m", "N/um", True, (0, 1), 1.0, 0.1, np.ones(2), np.ones(2), 0.9, None)
-    content = valid("identification", json_text(identification_file(found, [profile])))
-    interval = found.model.provenance.intervals[k]
+    content = valid(
+        "identification", json_text(identification_file(stack_identification, [profile]))
+    )
+    interval = stack_identification.model.provenance.intervals[k]
     assert content["parameters"][k]["interval"] == [interval.low, interval.high]
     assert content["profiles"][k] == {"unit": "N/m", "estimate": 1.0, "low": 0.9, "high": None}
-    (e, *_) = found.experiments
+    (e, *_) = stack_identification.experiments
     assert content["records"][0]["sha256"] == e.record.sha256
     assert content["records"][0]["rms_m"] == pytest.approx(content["rms_m"], rel=0.5)
-    assert valid("identification", json_text(identification_file(found)))["profiles"] == {}
+    assert (
+        valid("identification", json_text(identification_file(stack_identification)))["profiles"]
+        == {}
+    )
 
 
 def test_checks_are_as_their_schema_says() -> None:

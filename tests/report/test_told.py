@@ -65,27 +65,38 @@ def rival(*names: str) -> psa.StackDiagnosis:
 
 def graded() -> StackIdentification:
     """Return a fit whose parameters are known well, weakly, not at all, and only in pairs."""
-    found = identification()
-    errors = {n: 0.01 * found.model.values[n] for n in ("k_L", "tau", "R_s", "c_P")}
+    stack_identification = identification()
+    errors = {n: 0.01 * stack_identification.model.values[n] for n in ("k_L", "tau", "R_s", "c_P")}
     errors["tau"] *= 20.0
-    errors["A"] = 0.3 * found.model.parameter("A").typical(found.model.values)
-    matrix = np.eye(len(found.determinacy.names))
+    errors["A"] = 0.3 * stack_identification.model.parameter("A").typical(
+        stack_identification.model.values
+    )
+    matrix = np.eye(len(stack_identification.determinacy.names))
     for (a, b), r in {(0, 1): -0.97, (2, 3): 0.99, (0, 3): 0.94}.items():
         matrix[a, b] = matrix[b, a] = r
     known = replace(
-        found.determinacy, standard_errors=errors, undetermined=("R_s",), on_bound=("c_P",),
+        stack_identification.determinacy,
+        standard_errors=errors,
+        undetermined=("R_s",),
+        on_bound=("c_P",),
         correlations=matrix,
-    )  # fmt: skip
-    return replace(found, determinacy=known)
+    )
+    return replace(stack_identification, determinacy=known)
 
 
 def not_fitted() -> StackIdentification:
-    found = identification()
+    stack_identification = identification()
     none = replace(
-        found.determinacy, names=(), intervals={}, standard_errors={}, undetermined=(), on_bound=(),
-        covariance=np.zeros((0, 0)), correlations=np.zeros((0, 0)),
-    )  # fmt: skip
-    return replace(found, determinacy=none)
+        stack_identification.determinacy,
+        names=(),
+        intervals={},
+        standard_errors={},
+        undetermined=(),
+        on_bound=(),
+        covariance=np.zeros((0, 0)),
+        correlations=np.zeros((0, 0)),
+    )
+    return replace(stack_identification, determinacy=none)
 
 
 def wide(d: psa.StackDiagnosis) -> psa.StackDiagnosis:
@@ -169,10 +180,10 @@ def _shown(trace: dict[str, Any]) -> str:
     values = trace.get("y", trace.get("z"))
     if isinstance(values, list) and values and isinstance(values[0], str):
         return "; ".join(values)
-    found = numbers(values)
-    if not np.isfinite(found).any():
-        return f"{found.size} points"
-    return f"{found.size} points from {np.nanmin(found):.3g} to {np.nanmax(found):.3g}"
+    result = numbers(values)
+    if not np.isfinite(result).any():
+        return f"{result.size} points"
+    return f"{result.size} points from {np.nanmin(result):.3g} to {np.nanmax(result):.3g}"
 
 
 def told(result: Result) -> list[str]:
@@ -232,9 +243,9 @@ def _last_digit(number: str) -> float:
 @pytest.mark.parametrize("name", [*WHOLE, *OTHERWISE])
 def test_what_is_told_is_what_was_accepted(name: str) -> None:
     accepted = place(name).read_text("utf-8").splitlines()
-    found = now(name)
-    if len(found) != len(accepted) or not all(map(alike, found, accepted)):
-        change = "\n".join(difflib.unified_diff(accepted, found, "accepted", "found", lineterm=""))
+    texts = now(name)
+    if len(texts) != len(accepted) or not all(map(alike, texts, accepted)):
+        change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "found", lineterm=""))
         pytest.fail(f"{change}\nIf this is meant: python -m tests.report.test_told")
 
 

@@ -44,8 +44,10 @@ class HostCuda:
     def __init__(self, free: int) -> None:
         self.launches: list[int] = []
         device = SimpleNamespace(mem_info=(free, free), id=0)
-        told = SimpleNamespace(getDeviceProperties=lambda _: {"name": b"this processor"})
-        self.cuda = SimpleNamespace(Device=lambda: device, runtime=told)
+        simple_namespace = SimpleNamespace(
+            getDeviceProperties=lambda _: {"name": b"this processor"}
+        )
+        self.cuda = SimpleNamespace(Device=lambda: device, runtime=simple_namespace)
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any = np.float64) -> Any:
         """Return memory full of what must not be read: numbers in it are nan."""
@@ -73,15 +75,15 @@ class HostModule:
 
     def get_function(self, name: str) -> Any:
         """Return the launch of a kernel over a grid of blocks."""
-        found = re.search(rf"__global__ void {name}\(([^)]*)\)", self._code)
-        assert found is not None
-        wanted = [" ".join(q.replace("const", "").split()) for q in found[1].split(",")]
+        result = re.search(rf"__global__ void {name}\(([^)]*)\)", self._code)
+        assert result is not None
+        wanted = [" ".join(q.replace("const", "").split()) for q in result[1].split(",")]
 
         def launch(grid: tuple[int], block: tuple[int], arguments: tuple[Any, ...]) -> None:
-            given = [_passed(q, a) for q, a in zip(wanted, arguments, strict=True)]
+            items = [_passed(q, a) for q, a in zip(wanted, arguments, strict=True)]
             for number in range(grid[0] * block[0]):
                 self._library.psa_at(*(ctypes.c_longlong(k) for k in _place(number, block[0])))
-                getattr(self._library, name)(*given)
+                getattr(self._library, name)(*items)
             self._launches.append(grid[0] * block[0])
 
         return launch

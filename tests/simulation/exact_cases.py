@@ -79,8 +79,8 @@ def with_effect(name: str, stack_name: str = "P-885.51") -> Model:
 
 def times(samples: int, step: float) -> FloatArray:
     """Return instants (n,) [s] that are `step` apart, from 0 on."""
-    found: FloatArray = step * np.arange(samples, dtype=np.float64)
-    return found
+    values: FloatArray = step * np.arange(samples, dtype=np.float64)
+    return values
 
 
 def voltage(kind: str, share: FloatArray) -> FloatArray:
@@ -108,11 +108,11 @@ def composite(samples: int) -> FloatArray:
 
 def inputs(model: Model, t: FloatArray, relative: FloatArray) -> FloatArray:
     """Return all inputs (n, nu) for a voltage over the rated one; a temperature wanders."""
-    given = {"voltage": model.values["u_rated"] * relative}
+    table = {"voltage": model.values["u_rated"] * relative}
     if "temperature" in model.input_names:
         reference = model.values["temperature_reference"]
-        given["temperature"] = reference + 2.0 * np.sin(3.0 * t / t[-1])
-    return input_samples(model, len(t), given)
+        table["temperature"] = reference + 2.0 * np.sin(3.0 * t / t[-1])
+    return input_samples(model, len(t), table)
 
 
 def stepped(

@@ -276,7 +276,7 @@ def test_a_cache_that_cannot_be_trusted_is_left_alone(
     if (case, level) == ("a dangling link", "cache"):
         pytest.skip("the folder that the link names is made")
     wanted = tmp_path / "cache"
-    make, said = UNUSABLE[case]
+    make, statement = UNUSABLE[case]
     make(wanted if level == "cache" else wanted / "models")
     with caplog.at_level(logging.WARNING, "psa_casadi"):
         first, second = library(), library(7)
@@ -286,7 +286,7 @@ def test_a_cache_that_cannot_be_trusted_is_left_alone(
     assert first.is_relative_to(tmp_path / "private")
     assert len(caplog.records) == 1, caplog.text
     assert caplog.records[0].getMessage().startswith("The cache folder ")
-    assert any(word in caplog.text for word in said.split("|")), caplog.text
+    assert any(word in caplog.text for word in statement.split("|")), caplog.text
 
 
 @posix

@@ -68,16 +68,16 @@ def compare(
     u = inputs(model, t, relative)
     x0 = start_on(model, t, u).x
     steps, way = accurate(model, t, u, x0, rtol=rtol, hold=hold)
-    shown = steps.y[:, model.output_names.index(OUTPUT)]
+    displayed = steps.y[:, model.output_names.index(OUTPUT)]
     fine = max(1e-4 * rtol, 1e-12)
-    return error(shown, stepped(model, t, u, x0, rtol=fine, hold=hold)), way
+    return error(displayed, stepped(model, t, u, x0, rtol=fine, hold=hold)), way
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_composite_record_agrees_with_the_stepper(name: str) -> None:
     """A sine, a ramp, a hold and a step; the stepper takes its 1500 steps and more."""
-    found, way = compare(with_effect(name), times(SAMPLES, 1e-4), composite(SAMPLES))
-    assert found <= RTOL
+    result, way = compare(with_effect(name), times(SAMPLES, 1e-4), composite(SAMPLES))
+    assert result <= RTOL
     # thresholds that follow the rate fall within a microsecond at a reversal: no step is so short
     assert way == EXACT or name == "rate_dependent_hysteresis"
 
@@ -98,9 +98,9 @@ def test_every_stack_and_voltage_agrees_with_the_stepper(turn: int) -> None:
         step = SAMPLE_TIMES[(turn // len(VOLTAGES) + k) % len(SAMPLE_TIMES)]
         share = np.linspace(0.0, 1.0, SAMPLES)
         model = with_effect(NAMES[turn], stack_name)
-        found, way = compare(model, times(SAMPLES, step), voltage(kind, share))
+        result, way = compare(model, times(SAMPLES, step), voltage(kind, share))
         # where the stepper was taken it may err by what its own 0.0005 rtol a step adds up to
-        assert found <= (RTOL if way == EXACT else 3 * RTOL), (stack_name, kind, step)
+        assert result <= (RTOL if way == EXACT else 3 * RTOL), (stack_name, kind, step)
         ways.append(way)
     stepped_ones = 2 if NAMES[turn] == "rate_dependent_hysteresis" else 1
     assert ways.count(EXACT) >= len(ways) - stepped_ones
@@ -111,8 +111,8 @@ def test_every_stack_and_voltage_agrees_with_the_stepper(turn: int) -> None:
 def test_the_error_keeps_to_other_tolerances(name: str, rtol: float) -> None:
     """Exact steps do not know their error to less than 1e-6: then the stepper is taken."""
     relative = np.concatenate([composite(300), voltage("triangle", np.linspace(0.0, 1.0, 300))])
-    found, way = compare(with_effect(name), times(600, 1e-4), relative, rtol)
-    assert found <= rtol
+    result, way = compare(with_effect(name), times(600, 1e-4), relative, rtol)
+    assert result <= rtol
     assert way == (EXACT if rtol >= 1e-6 else STEPPER)
 
 
@@ -141,8 +141,8 @@ def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
         model, most = compose((*BASE, what), stack("P-885.51").values), 2 * RTOL
     else:
         model, most = with_effect(what), RTOL
-    found, way = compare(model, t, relative, hold=hold)
-    assert found <= most  # the stepper does not look for the jump
+    result, way = compare(model, t, relative, hold=hold)
+    assert result <= most  # the stepper does not look for the jump
     assert way == (STEPPER if what is JUMP else EXACT) or what == "voltage_saturation"
 
 
@@ -150,8 +150,8 @@ def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
     model, rng = stack("P-885.51"), np.random.default_rng(3)
     t = 1e-3 * (np.arange(300) + 0.01 * rng.standard_normal(300))
     v = 60.0 * (1.0 - np.cos(20.0 * t))
-    found = simulate(model, t, v)
-    assert found.way == STEPPER
+    result = simulate(model, t, v)
+    assert result.way == STEPPER
     regular = simulate(model, times(300, 1e-3), v)
     assert regular.way == EXACT
     # clocks tell times to a few digits only: that is no other step
@@ -167,8 +167,8 @@ def test_a_tone_whose_period_divides_a_sample_is_seen(period: float) -> None:
     """It looks constant at start, quarter, half and end of a sample."""
     values = {**stack("P-885.51").values, "beat_period": period}
     t = times(200, 1e-3)
-    found, _ = compare(compose((*BASE, BEAT), values), t, voltage("sine", t / t[-1]))
-    assert found <= RTOL
+    result, _ = compare(compose((*BASE, BEAT), values), t, voltage("sine", t / t[-1]))
+    assert result <= RTOL
 
 
 #: The quick tier has one stack with both mechanics, the full one every stack, in turn with either.
@@ -192,21 +192,21 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
     levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
     t = times(401, 1e-3)
     model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
-    found = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
+    result = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
     # its asymmetry goes on while the voltage comes to rest, which only the finest steps see
-    assert found.way == EXACT or stack_name == "micromanipulator"
+    assert result.way == EXACT or stack_name == "micromanipulator"
     path = reference.from_samples(corners, levels)
     every = slice(None, None, 10)
     true = reference.simulate(
         p, path, t[every], mechanics=mechanics, breakpoints=list(corners), rtol=1e-9
     )
-    assert error(found.outputs["displacement"][every], true.displacement) <= RTOL
+    assert error(result.outputs["displacement"][every], true.displacement) <= RTOL
     few = np.union1d(t[every], corners)
     path_at_corners = np.interp(few, corners, levels)
-    own = simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
-    assert own.way == STEPPER
-    shown = own.outputs["displacement"][np.isin(few, t[every])]
-    assert error(shown, true.displacement) <= RTOL
+    item = simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
+    assert item.way == STEPPER
+    displayed = item.outputs["displacement"][np.isin(few, t[every])]
+    assert error(displayed, true.displacement) <= RTOL
 
 
 def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
@@ -252,10 +252,10 @@ def test_every_effect_splits(base: tuple[Component, ...]) -> None:
 )
 def test_what_does_not_split_says_why(component: Component, reason: str) -> None:
     structure = compose((*BASE, component)).structure
-    found = split_of(structure)
-    assert isinstance(found, str)
-    assert re.search(reason, found)
-    assert why_not(structure, (OUTPUT,)) == found
+    result = split_of(structure)
+    assert isinstance(result, str)
+    assert re.search(reason, result)
+    assert why_not(structure, (OUTPUT,)) == result
 
 
 def test_sampled_states_do_not_split() -> None:
@@ -297,11 +297,11 @@ def results(name: str) -> list[FloatArray]:
     t = times(400, 1e-4)
     u = inputs(model, t, composite(400))
     unknowns: list[str | int] = ["k_L", "A", "R_s", "tau", "k_P"]
-    found = exact.run_exact(
+    exact_steps = exact.run_exact(
         model, t, u, start_on(model, t, u).x, tolerance=1e-7, unknowns=unknowns,
         outputs=(OUTPUT,), everything=True,
     )  # fmt: skip
-    return [found.shown, found.sensitivity, found.x, found.y]
+    return [exact_steps.shown, exact_steps.sensitivity, exact_steps.x, exact_steps.y]
 
 
 @pytest.mark.skipif(not vector_flags(), reason="this processor has no wide vectors")
@@ -322,12 +322,12 @@ def test_every_compiler_gives_the_same_bits(
     """Where `ziglang` is not installed, the system's compiler takes its place."""
     request.addfinalizer(_clear)
     monkeypatch.delenv(FLAGS_VARIABLE, raising=False)
-    found = []
+    items = []
     for command in ([tool(compiler)], zig_command()):
         _clear()
         monkeypatch.setenv("CC", " ".join(command))
-        found.append(results("backlash"))
-    for ours, theirs in zip(*found, strict=True):
+        items.append(results("backlash"))
+    for ours, theirs in zip(*items, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
@@ -338,13 +338,13 @@ def test_what_the_tests_compile_with_gives_the_bits_of_what_users_have(
     """Exact steps of one set and of four side by side, and the stepper: -Og, -O1 or -O3, -O2."""
     request.addfinalizer(_clear)
     monkeypatch.setenv("CC", tool("gcc"))
-    found = []
+    items = []
     for flags in ("-Og", ""):
         _clear()
         monkeypatch.setenv(FLAGS_VARIABLE, flags)
-        found.append([*results("backlash"), *_side_by_side("backlash"), *_stepped("backlash")])
-    assert len(found[0]) == 7
-    for ours, theirs in zip(*found, strict=True):
+        items.append([*results("backlash"), *_side_by_side("backlash"), *_stepped("backlash")])
+    assert len(items[0]) == 7
+    for ours, theirs in zip(*items, strict=True):
         np.testing.assert_array_equal(ours, theirs)
         assert np.ptp(ours) > 0.0
 
@@ -368,8 +368,8 @@ def _stepped(name: str) -> list[FloatArray]:
     model = with_effect(name)
     t = times(400, 1e-4)
     u = inputs(model, t, composite(400))
-    found = stepper.run(model, t, u, start_on(model, t, u).x, unknowns=["k_L", "A"])
-    return [found.y, found.sensitivity]
+    result = stepper.run(model, t, u, start_on(model, t, u).x, unknowns=["k_L", "A"])
+    return [result.y, result.sensitivity]
 
 
 LAST_PLACE = 2.0**-52

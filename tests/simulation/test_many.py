@@ -54,41 +54,41 @@ def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
     if effect:
         gains = {"load_stiffness": "load_gain", "rate_dependent_hysteresis": "rate_gain"}
         model = model.with_effect(_effect(effect), {gains[effect]: 0.02})
-    given = sets(model, 9)
-    together = simulate_many(model, given, record())
+    values = sets(model, 9)
+    together = simulate_many(model, values, record())
     assert together.shape == (9, 600)
     for k in (0, 3, 4, 8):
-        assert np.array_equal(simulate_many(model, [given[k]], record())[0], together[k])
-    assert np.array_equal(simulate_many(model, given[::-1], record()), together[::-1])
+        assert np.array_equal(simulate_many(model, [values[k]], record())[0], together[k])
+    assert np.array_equal(simulate_many(model, values[::-1], record()), together[::-1])
 
 
 def test_a_set_that_cannot_be_simulated_leaves_the_others_alone() -> None:
     model = stack("PTBS200")
     lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
-    given = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
-    found = simulate_many(model, given, record())
-    assert np.isnan(found[1, -1])
-    assert np.isfinite(found[[0, 2]]).all()
-    assert np.array_equal(found[[0, 2]], simulate_many(model, [given[0], given[2]], record()))
+    items = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
+    values = simulate_many(model, items, record())
+    assert np.isnan(values[1, -1])
+    assert np.isfinite(values[[0, 2]]).all()
+    assert np.array_equal(values[[0, 2]], simulate_many(model, [items[0], items[2]], record()))
 
 
 def test_what_is_kept_of_each_set() -> None:
     """Whole rows, a number and an array of each set; groups of four lanes and the stepper alike."""
     model = stack("P-885.51")
-    given = sets(model, 5)
+    values = sets(model, 5)
     for one in (record(), record(uneven=True)):
-        rows = simulate_many(model, given, one)
-        ranges = simulate_many(model, given, one, reduce=np.ptp)
-        thinned = simulate_many(model, given, one, reduce=lambda row: row[::100])
+        rows = simulate_many(model, values, one)
+        ranges = simulate_many(model, values, one, reduce=np.ptp)
+        thinned = simulate_many(model, values, one, reduce=lambda row: row[::100])
         assert np.array_equal(ranges, np.ptp(rows, axis=1))
         assert np.array_equal(thinned, rows[:, ::100])
 
 
 def test_sets_by_the_names_of_parameters() -> None:
     model = stack("P-885.51")
-    given = sets(model, 5)
-    columns = {name: [values[name] for values in given] for name in given[0]}
-    rows = simulate_many(model, given, record())
+    inputs = sets(model, 5)
+    columns = {name: [values[name] for values in inputs] for name in inputs[0]}
+    rows = simulate_many(model, inputs, record())
     assert np.array_equal(simulate_many(model, columns, record()), rows)
     with pytest.raises(InputError, match=r"in arrays of one length; .*k_L \(5,\), n \(1,\)"):
         simulate_many(model, {"k_L": columns["k_L"], "n": 1.5}, record())
@@ -120,20 +120,20 @@ def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
     The matrices' ladder is a thread's own.
     """
     model, one = stack("P-885.51"), record()
-    given = sets(model, 9)
-    rows = simulate_many(model, given, one)
-    np.testing.assert_array_equal(simulate_many(model, given, one, device="cuda"), rows)
+    values = sets(model, 9)
+    rows = simulate_many(model, values, one)
+    np.testing.assert_array_equal(simulate_many(model, values, one, device="cuda"), rows)
     assert host.launches[1:] == [128, 128]  # behind the question for the size of a room
     for name in ("range", "peak", "last"):
-        ours = simulate_many(model, given, one, reduce=name, device="cuda")
-        np.testing.assert_array_equal(ours, simulate_many(model, given, one, reduce=name))
-    ours = simulate_many(model, given, one, reduce=lambda row: row[::100], device="cuda")
+        ours = simulate_many(model, values, one, reduce=name, device="cuda")
+        np.testing.assert_array_equal(ours, simulate_many(model, values, one, reduce=name))
+    ours = simulate_many(model, values, one, reduce=lambda row: row[::100], device="cuda")
     np.testing.assert_array_equal(ours, rows[:, ::100])
     measured = replace(one, displacement=rows[3])
-    apart = simulate_many(model, given, measured, reduce="misfit", device="cuda")
+    apart = simulate_many(model, values, measured, reduce="misfit", device="cuda")
     np.testing.assert_allclose(apart, np.sqrt(np.mean((rows - rows[3]) ** 2, axis=1)), rtol=1e-13)
     np.testing.assert_allclose(
-        apart, simulate_many(model, given, measured, reduce="misfit"), rtol=1e-13
+        apart, simulate_many(model, values, measured, reduce="misfit"), rtol=1e-13
     )
     assert apart[3] == 0.0
 
@@ -141,11 +141,11 @@ def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
 def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
     model = stack("PTBS200")
     lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
-    given: list[dict[str, float]] = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
-    rows = simulate_many(model, given, record())
+    values: list[dict[str, float]] = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
+    rows = simulate_many(model, values, record())
     assert np.isnan(rows[1, -1])
-    np.testing.assert_array_equal(simulate_many(model, given, record(), device="cuda"), rows)
-    ranges = simulate_many(model, given, record(), reduce="range", device="cuda")
+    np.testing.assert_array_equal(simulate_many(model, values, record(), device="cuda"), rows)
+    ranges = simulate_many(model, values, record(), reduce="range", device="cuda")
     np.testing.assert_array_equal(ranges, np.ptp(rows, axis=1))
     assert host.launches
 
@@ -154,9 +154,9 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
 def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
     """The matrices' ladder is too large for a thread's own memory."""
     model = stack("P-885.51").with_effect(EFFECTS["load_stiffness"], {"load_gain": 0.02})
-    given = sets(model, 3)
-    rows = simulate_many(model, given, record())
-    np.testing.assert_array_equal(simulate_many(model, given, record(), device="cuda"), rows)
+    values = sets(model, 3)
+    rows = simulate_many(model, values, record())
+    np.testing.assert_array_equal(simulate_many(model, values, record(), device="cuda"), rows)
     assert host.launches[1:] == [128, 128, 128]  # one fits in the memory
 
 
@@ -166,8 +166,8 @@ def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
     gain = EFFECTS[effect].gain
     assert gain is not None
     model = stack("P-885.51").with_effect(EFFECTS[effect], {gain: 0.01})
-    given = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
-    models = [model.with_values(values) for values in given]
+    items = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
+    models = [model.with_values(values) for values in items]
     t, u = record().time, record_inputs(model, record(), 600)
     p, nominal = (
         np.array(rows).T
@@ -245,10 +245,10 @@ def test_a_gpu_gives_what_the_processor_gives() -> None:
     except InputError as error:
         pytest.skip(str(error))
     model = stack("P-885.51")
-    given = sets(model, 300)
-    rows = simulate_many(model, given, record())
+    inputs = sets(model, 300)
+    rows = simulate_many(model, inputs, record())
     size = np.ptp(rows, axis=1)
-    found = simulate_many(model, given, record(), device="cuda")
-    assert np.max(np.abs(found - rows) / size[:, None]) < 1e-9
-    ranges = simulate_many(model, given, record(), reduce="range", device="cuda")
-    np.testing.assert_array_equal(ranges, np.ptp(found, axis=1))
+    values = simulate_many(model, inputs, record(), device="cuda")
+    assert np.max(np.abs(values - rows) / size[:, None]) < 1e-9
+    ranges = simulate_many(model, inputs, record(), reduce="range", device="cuda")
+    np.testing.assert_array_equal(ranges, np.ptp(values, axis=1))

@@ -84,7 +84,7 @@ def test_a_column_has_the_bits_of_a_run_by_itself(name: str, stepped: bool) -> N
 def test_columns_are_differences_of_runs(stepped: bool) -> None:
     case = _motor()
     model, outputs, unknowns, t, u, x0 = case
-    found = _traced(case, outputs, "linear", stepped=stepped).sensitivity
+    result = _traced(case, outputs, "linear", stepped=stepped).sensitivity
     rows = [model.output_names.index(n) for n in outputs]
     for column, unknown in enumerate(unknowns):
         ends = []
@@ -96,7 +96,7 @@ def test_columns_are_differences_of_runs(stepped: bool) -> None:
                 start[unknown] += 1e-2 * sign
             ends.append(run(model, t, u, start, rtol=1e-11, values=values).y[:, rows])
         step = 1e-4 * model.values[unknown] if isinstance(unknown, str) else 1e-2
-        assert _off(found[:, :, column], (ends[0] - ends[1]) / (2.0 * step)) < 1e-5, unknown
+        assert _off(result[:, :, column], (ends[0] - ends[1]) / (2.0 * step)) < 1e-5, unknown
 
 
 FORCE = ca.SX.sym("f")
@@ -131,11 +131,11 @@ def test_equations_that_jump_by_the_input_take_exact_steps(name: str, hold: str)
     unknowns: Unknowns = ["k"]
     case = (model, ("place", "speed"), unknowns, t, u, x0)
     way = Way(1e-6, 1e-6)
-    found = trace(model, t, u, x0, way=way, outputs=case[1], unknowns=unknowns, hold=hold)
+    traced = trace(model, t, u, x0, way=way, outputs=case[1], unknowns=unknowns, hold=hold)
     fine = _traced(case, case[1], hold, stepped=True)
-    assert found.way == EXACT
-    assert np.max(np.abs(found.y - fine.y) / np.ptp(fine.y, axis=0)) < 1e-5
-    assert _off(found.sensitivity, fine.sensitivity) < 1e-5
+    assert traced.way == EXACT
+    assert np.max(np.abs(traced.y - fine.y) / np.ptp(fine.y, axis=0)) < 1e-5
+    assert _off(traced.sensitivity, fine.sensitivity) < 1e-5
 
 
 def test_equations_that_jump_by_a_state_or_the_time_do_not_split() -> None:

@@ -65,18 +65,18 @@ def test_models_without_a_displacement_are_compiled_for_all_outputs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where exact steps do not fit, the stepper is."""
-    asked: set[tuple[str, ...]] = set()
+    texts: set[tuple[str, ...]] = set()
     ready: list[Model] = []
 
     def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
-        asked.add(outputs)
+        texts.add(outputs)
         return exact.why_not(structure, outputs)
 
     monkeypatch.setattr(module, "why_not", why_not)
     monkeypatch.setattr(module, "make_ready", ready.append)
     sampled = loop()
     compiled([motor(), sampled])
-    assert asked == {("w", "i"), sampled.output_names}
+    assert texts == {("w", "i"), sampled.output_names}
     assert ready == [sampled]
 
 
@@ -107,8 +107,8 @@ def test_work_has_the_threads_that_are_wanted(
     """What is no number counts as nothing said: a thread for each core."""
     monkeypatch.setattr("os.cpu_count", lambda: 3)
     monkeypatch.setenv(VARIABLE, wanted)
-    found = side_by_side(lambda _: threading.get_ident(), range(3))
-    assert (set(found) == {threading.get_ident()}) == own
+    results = side_by_side(lambda _: threading.get_ident(), range(3))
+    assert (set(results) == {threading.get_ident()}) == own
 
 
 MODEL = compose(BASE)
@@ -138,12 +138,12 @@ def test_stages_count_for_themselves_and_simulations_of_all_threads(
         _simulate([])
         _work()
         _work()
-    found = {s.name: s for s in spent.stages}
-    assert list(found) == ["told by a worker", "outer", "inner", REST]
-    assert (found["outer"].runs, found["outer"].differentiated) == (6, 4)
-    assert found["told by a worker"].runs == 3
-    assert found["inner"].wall > 0.09 > found["outer"].wall
-    assert found["inner"].processor < 0.09
+    table = {s.name: s for s in spent.stages}
+    assert list(table) == ["told by a worker", "outer", "inner", REST]
+    assert (table["outer"].runs, table["outer"].differentiated) == (6, 4)
+    assert table["told by a worker"].runs == 3
+    assert table["inner"].wall > 0.09 > table["outer"].wall
+    assert table["inner"].processor < 0.09
 
 
 def test_a_stage_ends_with_an_error() -> None:

@@ -118,12 +118,12 @@ def test_zero_order_hold_is_the_drive_s_exponential() -> None:
     model = stack("PTBS200")
     t = np.arange(31) * 1e-5
     v = np.where(t < 1e-4, 50.0, -20.0)
-    found = simulate(model, t, v, hold="zero", from_rest_at_zero=True, rtol=1e-9).states["u"]
+    result = simulate(model, t, v, hold="zero", from_rest_at_zero=True, rtol=1e-9).states["u"]
     rc = model.values["R_s"] * model.values["C_p"]
     u = [0.0]
     for level in v[:-1]:
         u.append(level + (u[-1] - level) * np.exp(-1e-5 / rc))
-    np.testing.assert_allclose(found, u, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(result, u, rtol=0, atol=1e-6)
 
 
 def test_load_force_meets_the_bonding_layers() -> None:

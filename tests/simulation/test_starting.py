@@ -28,9 +28,9 @@ def _extended() -> Model:
     "model", [_extended(), compose(SIMPLIFIED)], ids=["extended cascade", "one mass"]
 )
 def test_another_stiffness_changes_forces_and_no_displacement(model: Model) -> None:
-    own = "k_B" if "k_B" in model.values else "k"
-    moved = chosen_start([], model, 3.0 * model.values[own])[0]
-    assert moved.values[own] == pytest.approx(3.0 * model.values[own])
+    item = "k_B" if "k_B" in model.values else "k"
+    moved = chosen_start([], model, 3.0 * model.values[item])[0]
+    assert moved.values[item] == pytest.approx(3.0 * model.values[item])
     before, after = simulate(model, TIME, VOLTAGE), simulate(moved, TIME, VOLTAGE)
     size = np.ptp(before.displacement)
     assert np.max(np.abs(after.displacement - before.displacement)) < 1e-6 * size
@@ -41,11 +41,11 @@ def test_another_stiffness_changes_forces_and_no_displacement(model: Model) -> N
 def test_a_start_says_whether_its_force_scale_is_known() -> None:
     stack = stack_model("P-885.51")
     assumed = stack.with_values({}, provenance=Provenance(force_scale="assumed"))
-    given = stack.with_values({}, provenance=Provenance(force_scale="given"))
+    model = stack.with_values({}, provenance=Provenance(force_scale="given"))
     assert chosen_start([RECORD], None, None)[1] is False
     assert chosen_start([RECORD], None, 6e7)[1] is True
     assert chosen_start([RECORD], assumed, None) == (assumed, False)
-    assert chosen_start([RECORD], given, None) == (given, True)
+    assert chosen_start([RECORD], model, None) == (model, True)
     both, known = chosen_start([RECORD], assumed, 6e7)
     assert known
     assert both.values["k_B"] == pytest.approx(6e7)

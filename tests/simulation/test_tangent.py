@@ -27,9 +27,9 @@ def _both(
     law = law_of(model.structure, effect)
     assert law is not None
     start = {s.name: 0.0 for s in model.structure.states if s.memory}
-    own = {n: v for n, v in start.items() if n in base.state_names}
-    course = course_of(base, t, u, own, way=_WAY, hold="linear", outputs=[output])
-    found = answer(
+    table = {n: v for n, v in start.items() if n in base.state_names}
+    course = course_of(base, t, u, table, way=_WAY, hold="linear", outputs=[output])
+    result = answer(
         opened(base, [law]), law, model, course, u, start,
         finite=step != 0.0, way=_WAY, outputs=[output],
     )  # fmt: skip
@@ -40,7 +40,7 @@ def _both(
         s0=begin.by_parameter[:, [column]],
     )  # fmt: skip
     simulated = whole.y[:, 0] if step else whole.sensitivity[:, 0, 0]
-    return found.y[:, 0, 0], simulated, found.error
+    return result.y[:, 0, 0], simulated, result.error
 
 
 #: Of a current limit the derivative at 0 is 0.

@@ -43,12 +43,12 @@ def study(
         raise InputError(f"There is no benchmark '{name}'; there are {', '.join(BENCHES)}.")
     run = bench(name)
     options = {"folder": folder, "size": size, "only": only, "seed": seed}
-    asked = {k: v for k, v in options.items() if v is not None}
-    for option in asked:
+    table = {k: v for k, v in options.items() if v is not None}
+    for option in table:
         if option not in signature(run).parameters:
             raise InputError(f"--{option}: '{name}' takes none; the list of benchmarks says which.")
     with working(f"benchmark {name}", quiet) as progress:
-        outcome = run(progress, quick, **asked)
+        outcome = run(progress, quick, **table)
     for titled in outcome.tables:
         show(f"\n{titled.title}\n", quiet)
         show_table(titled.table, quiet)

@@ -41,9 +41,9 @@ def test_every_benchmark_has_a_function_or_a_command() -> None:
 
 
 def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
-    said = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
-    assert said.exit_code == 2
-    assert "--folder: 'identify' takes none" in said.stderr.replace("\n", " ")
+    statement = CliRunner().invoke(app, ["identify", "--folder", str(tmp_path)])
+    assert statement.exit_code == 2
+    assert "--folder: 'identify' takes none" in statement.stderr.replace("\n", " ")
     with pytest.raises(psa.InputError, match="holds no CSV file"):
         floors.run(silent, False, folder=tmp_path)
 
@@ -51,15 +51,15 @@ def test_a_folder_is_for_a_benchmark_that_takes_one(tmp_path: Path) -> None:
 # ---- names
 
 
-def _sat(case: str, asked: Question, *causes: Named, left: str = "") -> names.Sat:
+def _sat(case: str, question: Question, *causes: Named, left: str = "") -> names.Sat:
     verdict = "cause_named" if causes else "unexplained" if left else "adequate"
-    return names.Sat(case, 0, asked, Answer(verdict, causes, left, 0.6 if left else 0.0), 2.0)
+    return names.Sat(case, 0, question, Answer(verdict, causes, left, 0.6 if left else 0.0), 2.0)
 
 
 def test_names_families_and_probabilities_are_counted() -> None:
     one = Question("one", (frozenset({"slow_creep"}),))
     foreign = Question("foreign", (frozenset({"sensor time"}),))
-    found = [
+    items = [
         _sat("exam/a", one, Named("slow_creep", 0.99, (), "plant relaxation", 0.99)),
         _sat("tune/b", one, Named("charge_leakage", 0.95, (), "drive relaxation", 0.97)),
         _sat("tune/c", one, left="plant relaxation"),
@@ -69,28 +69,28 @@ def test_names_families_and_probabilities_are_counted() -> None:
         _sat("tune/g", Question("clean", noise="pink")),
         _sat("tune/h", Question("clean", noise="pink"), Named("mains_hum", 0.9)),
     ]
-    figures, reliability, each = names.tables(found)
+    figures, reliability, each = names.tables(items)
     rows = {(row["hidden"], row["records"]): row for row in figures.rows}
     assert set(rows) == {
         *(("one cause", source) for source in ("exam", "tune", "all")),
         ("foreign cause", "tune"), ("clean, odd noise", "tune"), ("all", "all"),
     }  # fmt: skip
     causes = rows["one cause", "all"]
-    asked = ("in set", "alone", "family")
-    assert [causes[k] for k in asked] == ["1/3", "1/3", "2/3"]
+    requested = ("in set", "alone", "family")
+    assert [causes[k] for k in requested] == ["1/3", "1/3", "2/3"]
     assert (causes["found"], causes["wrong"]) == ("1/3", "1/2, 1/2")
     assert rows["foreign cause", "tune"]["honest"] == "1/3"
     assert rows["clean, odd noise", "tune"]["alarms"] == "1/2"
     assert rows["all", "all"]["wrong"] == "2/3, 1/2"
     assert [row["names: right"] for row in reliability.rows] == ["-", "0/2", "0/1", "0/1", "1/1"]
     assert [row["families: right"] for row in reliability.rows] == ["-", "2/3", "-", "0/1", "1/1"]
-    assert len(each.rows) == len(found)
-    own = names.stated(found)["names"]
+    assert len(each.rows) == len(items)
+    item = names.stated(items)["names"]
     squares = [0.01**2, 0.95**2, 0.6**2, 0.6**2, 0.9**2]
-    assert names.brier_score(own) == pytest.approx(np.mean(squares))
+    assert names.brier_score(item) == pytest.approx(np.mean(squares))
     logs = [np.log(p) for p in (0.99, 0.05, 0.4, 0.4, 0.1)]
-    assert names.log_score(own) == pytest.approx(-np.mean(logs))
-    assert len(names.picture(found).axes[0].containers) == 7
+    assert names.log_score(item) == pytest.approx(-np.mean(logs))
+    assert len(names.picture(items).axes[0].containers) == 7
 
 
 def test_a_pattern_of_names_that_no_case_has_is_told() -> None:
@@ -181,11 +181,11 @@ def test_a_probability_is_held_against_how_often_the_effect_is_the_cause() -> No
 
 def test_an_interval_of_the_gain_is_held_against_the_records_it_does_not_know() -> None:
     ends = ((45.0, 55.0), (51.0, 60.0)), ((25.0, 35.0), (20.0, 31.0))
-    found = [
+    items = [
         study.Covered("slow_creep", 50.0, (40.0, 45.0), ends[0], (50.0, 50.5)),
         study.Covered("ageing", 30.0, (10.0, 60.0), ends[1], (30.0, 30.0)),
     ]
-    blocks, records = study.intervals_table(found).table.rows
+    blocks, records = study.intervals_table(items).table.rows
     assert blocks[1:] == ("50 % (1 of 2)", "27.5 %")
     assert records[1:] == ("75 % (3 of 4)", "10.0 %")
 
@@ -199,10 +199,10 @@ def test_a_refusal_is_no_crash_and_a_crash_is_told() -> None:
     refused = changed.ended_of(still)
     assert refused.how == "refused"
     others = [("a", "adequate", "", 2.0), ("b", "crashed", "KeyError: 'x'", 9.0)]
-    told = changed.ends([refused, *(changed.Ended(*e) for e in others)])
-    assert ("crashed", "1", "") in told.table.rows
-    assert ("crashed because", "1", "KeyError: 'x'") in told.table.rows
-    assert "The slowest took 9 s" in told.note
+    titled_table = changed.ends([refused, *(changed.Ended(*e) for e in others)])
+    assert ("crashed", "1", "") in titled_table.table.rows
+    assert ("crashed because", "1", "KeyError: 'x'") in titled_table.table.rows
+    assert "The slowest took 9 s" in titled_table.note
 
 
 # ---- floors
@@ -245,13 +245,13 @@ def test_prior_sizes_tell_what_acts_from_what_does_not() -> None:
     kinds = np.r_[0, np.ones(3, dtype=int), np.full(60, 2)]
     truth = np.r_[5.0, 1.0, -2.0, 0.5, np.zeros(60)]
     y = features @ truth + 0.3 * rng.standard_normal(300)
-    found = ridge(features, kinds, y)
-    assert found.sigma == pytest.approx(0.3, rel=0.1)
-    np.testing.assert_allclose(found.weights[:4], truth[:4], atol=0.1)
+    result = ridge(features, kinds, y)
+    assert result.sigma == pytest.approx(0.3, rel=0.1)
+    np.testing.assert_allclose(result.weights[:4], truth[:4], atol=0.1)
     plain = np.linalg.lstsq(features, y, rcond=None)[0]
-    assert np.sum((found.weights - truth) ** 2) < 0.3 * np.sum((plain - truth) ** 2)
+    assert np.sum((result.weights - truth) ** 2) < 0.3 * np.sum((plain - truth) ** 2)
     without = ridge(features[:, :3], kinds[:3], y)
-    assert found.evidence > without.evidence + 10.0
+    assert result.evidence > without.evidence + 10.0
 
 
 def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
@@ -278,12 +278,12 @@ def test_modes_are_found_in_a_broadband_record() -> None:
     noise = 0.01 * np.std(x)
     y = x + noise * rng.standard_normal(len(v))
     held = HELD[: len(v)]
-    found = floor_of([Part(v, y, ~held)])
+    floor = floor_of([Part(v, y, ~held)])
     for f in truth:
-        mode = min(found.modes, key=lambda m: abs(m.frequency - f))
+        mode = min(floor.modes, key=lambda m: abs(m.frequency - f))
         assert mode.frequency == pytest.approx(f, rel=0.003)
         assert mode.damping == pytest.approx(damping, rel=0.1)
-    assert np.std((y - found.predicted[0])[held]) < 1.4 * noise
+    assert np.std((y - floor.predicted[0])[held]) < 1.4 * noise
 
 
 @slow
@@ -291,10 +291,10 @@ def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
     rng = np.random.default_rng(8)
     v, noise = triangles(rng), 0.01 * rng.standard_normal(N)
     y = v + 0.02 * np.sin(2 * np.pi * 0.2531 * np.arange(N) + 1.0) + noise
-    found = floor_of([Part(v, y, ~HELD)])
-    (line,) = [m for m in found.modes if m.damping == 0.0]
+    floor = floor_of([Part(v, y, ~HELD)])
+    (line,) = [m for m in floor.modes if m.damping == 0.0]
     assert line.frequency == pytest.approx(0.2531, abs=1e-5)
-    assert np.std((y - found.predicted[0])[HELD]) < 1.1 * np.std(noise)
+    assert np.std((y - floor.predicted[0])[HELD]) < 1.1 * np.std(noise)
     assert not floor_of([Part(v, v + noise, ~HELD)]).modes
 
 
@@ -302,9 +302,9 @@ def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
 def test_where_a_record_comes_from_is_found() -> None:
     rng = np.random.default_rng(5)
     v = 0.4 * triangles(rng)
-    found = floor_of([Part(v, plant(v, rng, state=1.0), ~HELD)]).histories[0]
-    assert found in HISTORIES
-    assert found[-1] == 1.0
+    result = floor_of([Part(v, plant(v, rng, state=1.0), ~HELD)]).histories[0]
+    assert result in HISTORIES
+    assert result[-1] == 1.0
 
 
 # ---- mirror: modes from a response, a model of them, and the score of its authors
@@ -314,10 +314,10 @@ def structure(softer: float = -0.03) -> mirror.Modes:
     """Return 15 modes with shapes that are a little out of phase, and a lag of 50 us."""
     rng, modes = np.random.default_rng(6), []
     for peak in mirror.PEAKS:
-        driven, shown = rng.normal(size=(2, 3)) + 0.1j * rng.normal(size=(2, 3))
+        driven, displayed = rng.normal(size=(2, 3)) + 0.1j * rng.normal(size=(2, 3))
         driven = driven / driven[np.argmax(np.abs(driven))]
         frequency = float(peak + rng.uniform(-4, 4))
-        modes.append(mirror.Mode(frequency, 0.01, softer, 0.4, driven, shown))
+        modes.append(mirror.Mode(frequency, 0.01, softer, 0.4, driven, displayed))
     return mirror.Modes(tuple(modes), rng.normal(size=(3, 3)), 5e-5, 0.2)
 
 
@@ -345,35 +345,35 @@ def test_modes_are_found_in_responses() -> None:
     responses = {a: response_of(truth, frequency, a) for a in (0.1, 0.3)}
     for response in responses.values():
         response[frequency > 3000] = 0.0  # no voltage there
-    found = mirror.modes_of(responses)
-    assert found.lag == pytest.approx(truth.lag, rel=1e-2)
-    assert found.rise == pytest.approx(truth.rise, rel=1e-2)
-    assert found.modes[-1].frequency == pytest.approx(truth.modes[-1].frequency, rel=2e-3)
-    for own, true in zip(found.modes[:-1], truth.modes[:-1], strict=True):  # below 3 kHz
-        assert own.frequency == pytest.approx(true.frequency, rel=1e-4)
-        assert own.damping == pytest.approx(true.damping, rel=1e-2)
-        assert own.softer == pytest.approx(true.softer, rel=2e-2)
-        assert own.lossier == pytest.approx(true.lossier, rel=5e-2)
-        np.testing.assert_allclose(own.driven, true.driven, atol=2e-2)
-        np.testing.assert_allclose(own.shown, true.shown, atol=5e-2)
+    modes = mirror.modes_of(responses)
+    assert modes.lag == pytest.approx(truth.lag, rel=1e-2)
+    assert modes.rise == pytest.approx(truth.rise, rel=1e-2)
+    assert modes.modes[-1].frequency == pytest.approx(truth.modes[-1].frequency, rel=2e-3)
+    for item, true in zip(modes.modes[:-1], truth.modes[:-1], strict=True):  # below 3 kHz
+        assert item.frequency == pytest.approx(true.frequency, rel=1e-4)
+        assert item.damping == pytest.approx(true.damping, rel=1e-2)
+        assert item.softer == pytest.approx(true.softer, rel=2e-2)
+        assert item.lossier == pytest.approx(true.lossier, rel=5e-2)
+        np.testing.assert_allclose(item.driven, true.driven, atol=2e-2)
+        np.testing.assert_allclose(item.shown, true.shown, atol=5e-2)
 
 
 @slow
 def test_the_mirror_answers_as_its_modes_say_at_an_amplitude() -> None:
     """In steady state, where the shapes at the stacks have one phase: it has their tables then."""
-    n, rng, given = 4096, np.random.default_rng(8), structure()
-    modes = [replace(m, driven=np.real(m.driven).astype(np.complex128)) for m in given.modes]
-    found = replace(given, modes=tuple(modes))
+    n, rng, inputs = 4096, np.random.default_rng(8), structure()
+    modes = [replace(m, driven=np.real(m.driven).astype(np.complex128)) for m in inputs.modes]
+    result = replace(inputs, modes=tuple(modes))
     lines = np.zeros((n // 2 + 1, 3), dtype=np.complex128)
     lines[1:1800] = np.exp(2j * np.pi * rng.uniform(size=(1799, 3)))
     u = np.fft.irfft(lines, n=n, axis=0)
     u, lines = 0.3 / np.std(u) * u, 0.3 / np.std(u) * lines
-    said = mirror.played(mirror.mirror(found), np.stack([u, u], axis=2))
+    statement = mirror.played(mirror.mirror(result), np.stack([u, u], axis=2))
     errors, frequency = [], np.linspace(0.0, mirror.RATE / 2, n // 2 + 1)
     for amplitude in (0.1, 0.3):
-        response = response_of(found, frequency, amplitude)
+        response = response_of(result, frequency, amplitude)
         true = np.fft.irfft(np.einsum("kij,kj->ki", response, lines), n=n, axis=0)
-        errors.append([float(np.std(said[:, :, k] - true) / np.std(true)) for k in range(2)])
+        errors.append([float(np.std(statement[:, :, k] - true) / np.std(true)) for k in range(2)])
     assert max(errors[1]) < 0.02
     assert min(errors[0]) > 0.1
 
@@ -382,10 +382,10 @@ def test_an_exact_simulation_scores_nothing_and_noise_scores_its_share() -> None
     y = np.random.default_rng(4).normal(size=(4 * PERIOD, 3, 3, 2)) * [[[1.0]], [[2.0]], [[3.0]]]
     assert len(y) > mirror.SKIPPED
     assert np.all(mirror.score(y, y) == 0.0)
-    said = y.copy()
-    said[mirror.SKIPPED :] += 0.5 * np.std(y[mirror.SKIPPED :], axis=0)
-    said[: mirror.SKIPPED] += 100.0
-    np.testing.assert_allclose(mirror.score(y, said), 0.5)
+    paths = y.copy()
+    paths[mirror.SKIPPED :] += 0.5 * np.std(y[mirror.SKIPPED :], axis=0)
+    paths[: mirror.SKIPPED] += 100.0
+    np.testing.assert_allclose(mirror.score(y, paths), 0.5)
 
 
 # ---- sampling: the one equation that PyMC gets shows what the whole stack shows
@@ -398,27 +398,27 @@ NUMPY = SimpleNamespace(
 
 def test_the_reduced_equation_shows_the_stack_at_other_values() -> None:
     model = sampling.stack().with_values({"k_L": 7.9, "A": -1.5, "delta": -0.2, "n": 1.7})
-    v, given = model.values, sampling.record()
+    v, inputs = model.values, sampling.record()
     p = [v["A"], v["delta"], v["n"]]
-    found = solve_ivp(
-        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, given.time[-1]),
-        [30.0], t_eval=given.time, method="LSODA", rtol=1e-9, atol=1e-6,
+    result = solve_ivp(
+        lambda t, y: [sampling.hysteresis_rate(y[0], t, p, v, NUMPY)], (0.0, inputs.time[-1]),
+        [30.0], t_eval=inputs.time, method="LSODA", rtol=1e-9, atol=1e-6,
         max_step=sampling.LEG / 20,
     )  # fmt: skip
     compliance = 1.0 / v["k_P"] + 1.0 / v["k_B"]
-    reduced = compliance * (v["k_L"] * given.voltage + found.y[0])
-    whole = psa.simulate(model, given.time, given.voltage, memory={"f_H": 30.0}, rtol=1e-9)
+    reduced = compliance * (v["k_L"] * inputs.voltage + result.y[0])
+    whole = psa.simulate(model, inputs.time, inputs.voltage, memory={"f_H": 30.0}, rtol=1e-9)
     miss = reduced - whole.displacement
     assert np.max(np.abs(miss - np.mean(miss))) < 1e-4 * np.ptp(whole.displacement)
-    assert np.ptp(found.y[0]) > 50.0  # it is the hysteresis that is compared
+    assert np.ptp(result.y[0]) > 50.0  # it is the hysteresis that is compared
 
 
 def test_the_table_states_effective_samples_per_processor_time() -> None:
     draws = np.random.default_rng(0).standard_normal((20000, 2))
     fast, slow = (sampling.Drawn(n, draws, 8000.0, s) for n, s in (("a", 2.0), ("b", 500.0)))
-    told = sampling.speed([fast, slow])
-    assert "250 times" in told.note
-    for row, seconds in zip(told.table.rows, (2.0, 500.0), strict=True):
+    titled_table = sampling.speed([fast, slow])
+    assert "250 times" in titled_table.note
+    for row, seconds in zip(titled_table.table.rows, (2.0, 500.0), strict=True):
         assert float(row[4]) == pytest.approx(20000, rel=0.1)
         assert float(row[6]) == pytest.approx(float(row[4]) / seconds, rel=0.01)
 

@@ -87,7 +87,7 @@ def test_the_score_of_answers_made_by_hand_is_as_counted(data: Path) -> None:
     done = scored(data)
     assert done.returncode == 0, done.stderr
     result = json.loads((data.parent / "score.json").read_text("utf-8"))
-    found = result["figures"]
+    matches = result["figures"]
     expected = {
         "answered": [5, 6],
         "detected, 0.3 to 3 times the noise": [2, 2],
@@ -104,13 +104,13 @@ def test_the_score_of_answers_made_by_hand_is_as_counted(data: Path) -> None:
         "two causes: both named first, no third": [1, 1],
         "interval of the gain holds it": [1, 1],
     }
-    assert {k: found[k] for k in expected} == expected
-    assert found["held-out error over the noise, median"] == pytest.approx(1.0)
-    assert found["the fitted base's, median"] == pytest.approx(np.sqrt(5.0))
+    assert {k: matches[k] for k in expected} == expected
+    assert matches["held-out error over the noise, median"] == pytest.approx(1.0)
+    assert matches["the fitted base's, median"] == pytest.approx(np.sqrt(5.0))
     # half of an effect of power 4 is left: a power of 1 beside the noise
-    assert found["foreign: share of the excess removed, median"] == pytest.approx(0.75)
+    assert matches["foreign: share of the excess removed, median"] == pytest.approx(0.75)
     # 0; 0.25 + 0.25; 0.36 + 0.36; 0; and 2 for the weak one that has no answer
-    assert found["Brier score"] == pytest.approx((0.0 + 0.5 + 0.72 + 0.0 + 2.0) / 5)
+    assert matches["Brier score"] == pytest.approx((0.0 + 0.5 + 0.72 + 0.0 + 2.0) / 5)
     assert [r["of"] for r in result["reliability"]] == [2, 1, 1]
 
 

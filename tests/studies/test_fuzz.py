@@ -86,10 +86,10 @@ _PIECES = st.sampled_from(
 @given(st.text(max_size=8) | st.lists(_PIECES, max_size=8).map("".join))
 def test_any_text_is_a_unit_or_is_refused(text: str) -> None:
     try:
-        found = parse_unit(text)
+        unit = parse_unit(text)
     except InputError:
         return
-    assert found.ratio > 0
+    assert unit.ratio > 0
 
 
 def _behaviour(data: bytes, folder: Path) -> Iterator[Found]:
@@ -127,8 +127,8 @@ def _counted(**options: object) -> Tally:
 
 
 def test_every_way_to_fail_is_seen_and_counted(tmp_path: Path) -> None:
-    told: list[str] = []
-    tally = _counted(keep=tmp_path, progress=told.append)
+    texts: list[str] = []
+    tally = _counted(keep=tmp_path, progress=texts.append)
     kinds = {kind: n for (_, kind), n in tally.kinds.items()}
     expected = dict.fromkeys((campaign.HANG, campaign.FALSE_PASS, campaign.LEFT_OVER), 1)
     expected |= dict.fromkeys((campaign.CRASH, campaign.FOREIGN), 2)
@@ -140,9 +140,9 @@ def test_every_way_to_fail_is_seen_and_counted(tmp_path: Path) -> None:
     assert "SIGSEGV" in first[2].first.sentence
     assert "MemoryError" in first[8].first.sentence
     assert {p.read_text() for p in tmp_path.iterdir()} == set(_BEHAVIOURS[2:9])
-    assert any(line.endswith(f"--replay {tmp_path}/fake-7-5.txt") for line in told)
-    shown = "\n".join(map(str, tables(tally)))
-    assert "Distinct failures" in shown
+    assert any(line.endswith(f"--replay {tmp_path}/fake-7-5.txt") for line in texts)
+    text = "\n".join(map(str, tables(tally)))
+    assert "Distinct failures" in text
 
 
 def test_one_seed_gives_one_set_of_inputs() -> None:

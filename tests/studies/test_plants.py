@@ -50,8 +50,8 @@ def solve_as_ode(s: Stack, times: FloatArray, command: FloatArray) -> FloatArray
     displacement = [0.0]
     scale = np.array([1e-9, 1e-7, 1e-7, 1e-14, 1e-9, 1e-14, 1e-9])
     for start, end in pairwise(times.tolist()):
-        found = solve_ivp(rate, (start, end), state, method="LSODA", rtol=1e-9, atol=scale)
-        state = found.y[:, -1]
+        result = solve_ivp(rate, (start, end), state, method="LSODA", rtol=1e-9, atol=scale)
+        state = result.y[:, -1]
         displacement.append(float(state[5]))
     return np.asarray(displacement)
 
@@ -126,9 +126,9 @@ def test_effect_vanishes_at_gain_zero_and_adds_what_it_did(effect: HiddenEffect,
     assert np.ptp(added) > 1e6 * np.ptp(part.displacement)
     figures = [np.sqrt(np.mean(added**2)), added.min(), added.max(), added[-1]]
     line = "\t".join([effect.name, *(f"{x:.7g}" for x in figures)])
-    told = f"Add this line to {KEPT.name}, or what it says now is another plant: {line}"
-    assert effect.name in ADDED, told
-    np.testing.assert_allclose(figures, ADDED[effect.name], rtol=1e-5, atol=1e-6, err_msg=told)
+    text = f"Add this line to {KEPT.name}, or what it says now is another plant: {line}"
+    assert effect.name in ADDED, text
+    np.testing.assert_allclose(figures, ADDED[effect.name], rtol=1e-5, atol=1e-6, err_msg=text)
 
 
 @pytest.mark.parametrize(

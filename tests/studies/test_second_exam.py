@@ -31,8 +31,8 @@ def test_the_halves_have_the_same_number_of_each_group_and_name_what_exists() ->
     assert {row["extra"] for row in TABLE.values() if "extra" in row} == set(FOREIGN)
     of_group = {"clean": 0, "one": 1, "two": 2, "three": 3, "foreign": 1}
     for name in TABLE:
-        asked = question(name)
-        assert len(asked.accepted) in {of_group[asked.group], "hum" in name}
+        requested = question(name)
+        assert len(requested.accepted) in {of_group[requested.group], "hum" in name}
 
 
 def test_a_seed_makes_a_record_and_another_one_another(tmp_path: Path) -> None:
@@ -50,12 +50,12 @@ def test_what_is_hidden_is_larger_than_the_noise(name: str) -> None:
 
 @pytest.mark.parametrize("name", slow_but(("t_clean_pink_stairs",), CLEAN))
 def test_healthy_stacks_are_healthy_and_their_noise_is_as_large_as_said(name: str) -> None:
-    p, said = play(name, 3), TABLE[name]["noise_um"]
+    p, statement = play(name, 3), TABLE[name]["noise_um"]
     assert not p.plant.hidden
     assert not question(name).other_hysteresis
     assert size_um(name, 3) < 1e-9
     spread = float(np.std(p.reading - p.clean))
-    assert spread == pytest.approx(said, rel={"outliers": 3.0}.get(name.split("_")[2], 0.35))
+    assert spread == pytest.approx(statement, rel={"outliers": 3.0}.get(name.split("_")[2], 0.35))
 
 
 def test_hidden_forms_move_the_reading_as_said() -> None:
@@ -76,7 +76,7 @@ def test_hidden_forms_move_the_reading_as_said() -> None:
 
 def test_other_hysteresis_counts_neither_way_unless_it_is_what_is_hidden() -> None:
     for name in TABLE:
-        asked = question(name)
-        if asked.other_hysteresis and asked.group != "foreign":
-            memory = [names for names in asked.accepted if names & HYSTERESIS]
+        requested = question(name)
+        if requested.other_hysteresis and requested.group != "foreign":
+            memory = [names for names in requested.accepted if names & HYSTERESIS]
             assert all("hysteresis_memory" in names for names in memory)

@@ -47,13 +47,13 @@ def test_the_columns_are_those_of_the_fmu(tmp_path: Path) -> None:
         assert "charge" not in page.partition('id="told">')[2]
         assert tab.give("model.json", b"{}") == 400
         assert tab.give("run.csv", _measured(tmp_path)) == 200
-        seen = tab.state()["items"][0]["seen"]
-        assert seen["head"]["guess"] == {"time": [0, "s"], "inflow": [1, "1"]}
+        observed = tab.state()["items"][0]["seen"]
+        assert observed["head"]["guess"] == {"time": [0, "s"], "inflow": [1, "1"]}
         assert tab.post("/settings", {"columns": "level=h:%"}) == 200
-        seen = tab.state()["items"][0]["seen"]
-        assert seen["problems"] == []
-        assert seen["record"]["reached"]["level"][2] == "%"
-        assert base64.b64decode(seen["record"]["picture"]).startswith(b"\x89PNG")
+        observed = tab.state()["items"][0]["seen"]
+        assert observed["problems"] == []
+        assert observed["record"]["reached"]["level"][2] == "%"
+        assert base64.b64decode(observed["record"]["picture"]).startswith(b"\x89PNG")
         assert tab.post("/start") == 200
         (desk.folder / "let_go").touch()
         tab.until("done")

@@ -37,8 +37,8 @@ class Tab:
         self.cookie = ""
 
     def headers(self, method: str) -> dict[str, str]:
-        own = {"Host": f"127.0.0.1:{self.port}", "Cookie": self.cookie}
-        return own | ({"Origin": f"http://127.0.0.1:{self.port}"} if method == "POST" else {})
+        table = {"Host": f"127.0.0.1:{self.port}", "Cookie": self.cookie}
+        return table | ({"Origin": f"http://127.0.0.1:{self.port}"} if method == "POST" else {})
 
     def ask(
         self, method: str, path: str, body: Any = None, **headers: str
@@ -61,14 +61,14 @@ class Tab:
         return self.post("/files", data, X_Name=quote(name))
 
     def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.ask("GET", "/state")[2])
-        return found
+        table: dict[str, Any] = json.loads(self.ask("GET", "/state")[2])
+        return table
 
     def wait(
         self, there: Callable[[dict[str, Any]], object], limit_s: float = 60.0
     ) -> dict[str, Any]:
-        begun = time.monotonic()
-        while time.monotonic() < begun + limit_s:
+        value = time.monotonic()
+        while time.monotonic() < value + limit_s:
             if there(state := self.state()):
                 return state
             time.sleep(0.02)
@@ -78,16 +78,16 @@ class Tab:
         return self.wait(lambda state: state["run"]["status"] == status, limit_s)
 
     def searched(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.wait(lambda state: state["run"]["events"])["run"]
-        return found
+        table: dict[str, Any] = self.wait(lambda state: state["run"]["events"])["run"]
+        return table
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
     limits = Limits(one=5000, together=8000, files=3)
     desk = Desk(tmp_path, ["slow_creep"], limits=limits, module="tests.workbench.small_job")
-    with served(0, desk) as found:
-        yield found
+    with served(0, desk) as result:
+        yield result
 
 
 @pytest.fixture
@@ -122,12 +122,12 @@ def test_a_file_is_read_and_its_columns_are_mapped(tab: Tab) -> None:
     assert head["guess"] == {"time": [0, "ms"], "voltage": [1, "V"], "displacement": [2, "um"]}
     assert "'displacement' has no unit" in " ".join(item["seen"]["problems"])
     assert tab.post("/settings", {"columns": "displacement=pos:10um"}) == 200
-    seen = tab.state()["items"][0]["seen"]
-    assert seen["problems"] == []
-    low, high, unit = seen["record"]["reached"]["displacement"]
+    observed = tab.state()["items"][0]["seen"]
+    assert observed["problems"] == []
+    low, high, unit = observed["record"]["reached"]["displacement"]
     assert (low, high, unit) == (0.0, pytest.approx(49 * 10e-6), "m")
-    assert base64.b64decode(seen["record"]["picture"]).startswith(b"\x89PNG")
-    assert seen["record"]["seconds"] == pytest.approx(0.099)
+    assert base64.b64decode(observed["record"]["picture"]).startswith(b"\x89PNG")
+    assert observed["record"]["seconds"] == pytest.approx(0.099)
     assert tab.post("/settings", {"columns": "displacement=pas:um"}) == 200
     assert "'pas'" in tab.state()["items"][0]["seen"]["problems"][0]
 
@@ -285,9 +285,9 @@ def test_every_request_is_answered(
     line: str, body: bytes, headers: dict[str, str], tab: Tab
 ) -> None:
     all_ = {**tab.headers("POST"), "Content-Length": str(len(body)), **headers}
-    told = "".join(f"{n}: {t}\r\n" for n, t in all_.items())
+    text = "".join(f"{n}: {t}\r\n" for n, t in all_.items())
     with socket.create_connection(("127.0.0.1", tab.port), timeout=20) as way:
-        way.sendall(f"{line}\r\n{told}\r\n".encode() + body)
+        way.sendall(f"{line}\r\n{text}\r\n".encode() + body)
         answers = b"".join(iter(lambda: way.recv(65536), b""))
     assert len(re.findall(rb"HTTP/1.1 (4|501)|Error code: 400", answers)) == 1, answers
     assert tab.ask("GET", "/state")[0] == 200
@@ -310,10 +310,10 @@ def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.Mo
     for name in ("gratings", "ruled", "numpy", "matplotlibrc"):
         data = f"open({str(ran)!r}, 'w')".encode()
         desk.add(f"{name}.py", io.BytesIO(data), len(data))
-    told = Run(["effects", "encoder_ripple", "--effects=gratings"], folder, lambda: None)
-    while told.status == "running":
+    run = Run(["effects", "encoder_ripple", "--effects=gratings"], folder, lambda: None)
+    while run.status == "running":
         time.sleep(0.05)
-    assert (told.status, ran.exists()) == ("done", False), told.state()
+    assert (run.status, ran.exists()) == ("done", False), run.state()
     assert sorted(p.name for p in folder.iterdir()) == ["records"]
 
 

@@ -33,16 +33,16 @@ PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
 def address(tmp_path: Path) -> Iterator[str]:
     command = [sys.executable, "-m", "psa_casadi.cli", "web", "--diagnose", "--no-browser"]
     (tmp_path / "tmp").mkdir()
-    given = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    table = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
     process = subprocess.Popen(
-        command, env=given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, env=table, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stdout is not None
     yield process.stdout.readline().split()[1]
     process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=20)[1]
-    assert process.returncode == 0, said
-    assert "Ended" in said
+    statement = process.communicate(timeout=20)[1]
+    assert process.returncode == 0, statement
+    assert "Ended" in statement
     assert not list((tmp_path / "tmp").iterdir())
 
 
@@ -75,11 +75,11 @@ def faults(tab: Steered, axe: str) -> list[str]:
     tab.run(f"{axe}; window.found = null; axe.run({{resultTypes: ['violations']}}).then("
             "r => { window.found = r.violations; }); 0")  # fmt: skip
     tab.until("window.found")
-    told: list[str] = tab.run(
+    texts: list[str] = tab.run(
         "window.found.filter(v => ['serious', 'critical'].includes(v.impact)).map("
         "v => v.id + ': ' + v.nodes[0].html)"
     )
-    return told
+    return texts
 
 
 def report_runs(tab: Steered, address: str) -> None:
@@ -104,8 +104,8 @@ def of_another_layout(tab: Steered, path: Path, line: str) -> None:
     tab.until("document.querySelector('#layout1c2')")
     tab.run("s = document.querySelector('#layout1c2'); s.value = 'displacement'; s.onchange()")
     tab.until("document.querySelectorAll('#curves figure').length === 2")
-    said = "time=time:s", "voltage=voltage:V", "displacement=pos:um"
-    both = ",".join([line, *(f"{path.name}@{part}" for part in said)])
+    statement = "time=time:s", "voltage=voltage:V", "displacement=pos:um"
+    both = ",".join([line, *(f"{path.name}@{part}" for part in statement)])
     assert tab.run("document.querySelector('#set-columns').value") == both
     picture(tab, "layouts")
     tab.run(f"document.querySelector('[aria-label=\"Remove {path.name}\"]').click()")
@@ -114,12 +114,12 @@ def of_another_layout(tab: Steered, path: Path, line: str) -> None:
 
 def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
     """Every request went to the server itself, and the console has no error."""
-    told = [(e.get("method"), e.get("params", {})) for e in tab.heard]
-    asked = [p["request"]["url"] for m, p in told if m == "Network.requestWillBeSent"]
-    own = (address.partition("?")[0], "data:", "blob:")
-    assert asked
-    assert [u for u in asked if not u.startswith(own)] == []
-    words = [p["entry"] for m, p in told if m == "Log.entryAdded"]
+    items = [(e.get("method"), e.get("params", {})) for e in tab.heard]
+    requested = [p["request"]["url"] for m, p in items if m == "Network.requestWillBeSent"]
+    item = (address.partition("?")[0], "data:", "blob:")
+    assert requested
+    assert [u for u in requested if not u.startswith(item)] == []
+    words = [p["entry"] for m, p in items if m == "Log.entryAdded"]
     assert [w for w in words if w["level"] == "error"] == []
 
 

@@ -145,9 +145,9 @@ class Rival:
     @property
     def truth(self) -> FloatArray:
         """Return the coordinates (size,) at which it is the truth that a record shall show."""
-        own = np.zeros(len(self.theta)) if self.less is None else self.less
+        item = np.zeros(len(self.theta)) if self.less is None else self.less
         low, high = self.bounds()
-        return np.clip(np.append(own, np.zeros(self.size - len(own))), low, high)
+        return np.clip(np.append(item, np.zeros(self.size - len(item))), low, high)
 
     @cached_property
     def starts(self) -> Mapping[str, tuple[float, float]]:
@@ -157,11 +157,11 @@ class Rival:
             return {name: (size, prior) for (name, size), prior in memories}
         planned: Any = Signals(name="planned", time=np.arange(8.0), columns={})
         new = replace(whole(planned), known_start=self.known_start, channels=(_NOTHING,))
-        found = unknowns_around(self.model, (), [new], [1.0], placed=self.model)
+        unknowns = unknowns_around(self.model, (), [new], [1.0], placed=self.model)
         return {
             name: (float(size), float(prior))
             for name, size, prior in zip(
-                found.started[0], found.start_scale[0], found.prior, strict=False
+                unknowns.started[0], unknowns.start_scale[0], unknowns.prior, strict=False
             )
         }
 
@@ -169,11 +169,11 @@ class Rival:
     def _offsets(self) -> FloatArray:
         """Return what the coordinates of the offsets add to the outputs, (outputs, zeros)."""
         sizes = dict(zip(self.model.output_names, self.model.output_nominals(), strict=True))
-        found = np.zeros((len(self.outputs), len(self.zeros)))
+        values = np.zeros((len(self.outputs), len(self.zeros)))
         for column, name in enumerate(self.zeros):
             size = _OFFSET if is_stack(self.model) else sizes[name]
-            found[self.outputs.index(name), column] = size
-        return found
+            values[self.outputs.index(name), column] = size
+        return values
 
     @property
     def size(self) -> int:
@@ -210,26 +210,26 @@ class Rival:
 
     def sensitivities(self, record: Signals, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the outputs (n, m) and their exact derivatives by delta (n, m, size)."""
-        found, count = self._traced(record, delta, self.unknowns.names), len(self.theta)
+        result, count = self._traced(record, delta, self.unknowns.names), len(self.theta)
         slopes = self.unknowns.slopes(self.theta + delta[:count])
-        by_parameter = found.sensitivity[:, :, :count] @ slopes
-        by_start = found.sensitivity[:, :, count:] * [size for size, _ in self.starts.values()]
+        by_parameter = result.sensitivity[:, :, :count] @ slopes
+        by_start = result.sensitivity[:, :, count:] * [size for size, _ in self.starts.values()]
         offsets = np.broadcast_to(self._offsets, (record.n, *self._offsets.shape))
-        return found.y, np.concatenate([by_parameter, by_start, offsets], axis=2)
+        return result.y, np.concatenate([by_parameter, by_start, offsets], axis=2)
 
     def _traced(self, record: Signals, delta: FloatArray, wanted: Sequence[str]) -> Traced:
         """Return outputs with their offsets, and derivatives by `wanted` and the starts."""
         model, start = self.moved(delta)
         planned: Any = record if self.hold == record.hold else replace(record, hold=self.hold)
-        found = trace_record(
+        traced = trace_record(
             model, planned, start, wanted, stop=record.n, way=Way(RTOL, RTOL), outputs=self.outputs
         )
-        return replace(found, y=found.y + self._offsets @ delta[self.size - len(self.zeros) :])
+        return replace(traced, y=traced.y + self._offsets @ delta[self.size - len(self.zeros) :])
 
 
-def whitened(noise: Sequence[Colour], shown: FloatArray) -> FloatArray:
+def whitened(noise: Sequence[Colour], values: FloatArray) -> FloatArray:
     """Return outputs (n, m), or their derivatives (n, m, k), over their noise: (m n,), (m n, k)."""
-    parts = [own.whiten(shown[:, j]) / own.level for j, own in enumerate(noise)]
+    parts = [item.whiten(values[:, j]) / item.level for j, item in enumerate(noise)]
     white: FloatArray = np.concatenate(parts)
     return white
 
@@ -244,8 +244,8 @@ def rival_of_fit(
     """
     count, full = len(fit.unknowns.names), np.diag(1.0 / fit.unknowns.prior**2)
     channels = [c for c in fit.channels if not c.channel.factors]
-    for channel, own in zip(channels, noise, strict=True):
-        white = own.whiten(channel.jacobian) / own.level
+    for channel, item in zip(channels, noise, strict=True):
+        white = item.whiten(channel.jacobian) / item.level
         full = full + white.T @ white
     inner, cross = full[count:, count:], full[:count, count:]
     known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
@@ -265,10 +265,10 @@ def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
     if gain is None or gain not in names:
         return np.zeros(len(names))
     k = names.index(gain)
-    own = np.linalg.pinv(known, hermitian=True)[:, k]
+    item = np.linalg.pinv(known, hermitian=True)[:, k]
     size = fit.model.values[gain] / fit.unknowns.scale[k]
-    shift = min(_CAUTION * float(np.sqrt(max(own[k], 0.0))), _LOSS * abs(size))
-    less: FloatArray = -float(np.sign(size)) * shift * own / max(own[k], 1e-300)
+    shift = min(_CAUTION * float(np.sqrt(max(item[k], 0.0))), _LOSS * abs(size))
+    less: FloatArray = -float(np.sign(size)) * shift * item / max(item[k], 1e-300)
     farthest = float(np.max(np.abs(less[fit.unknowns.log[: len(less)]]), initial=0.0))
     return less * min(1.0, _FARTHEST / max(farthest, 1e-300))
 
@@ -294,11 +294,11 @@ def noise_of_fit(fit: Fit) -> tuple[tuple[SensorNoise, ...], tuple[Colour, ...]]
     """
     channels = [c for c in fit.channels if not c.channel.factors]
     colours = tuple(colour_of(c.residuals, c.lengths) for c in channels)
-    found = []
+    items = []
     for channel, colour in zip(channels, colours, strict=True):
         first = colour.autoregression[0]
-        found.append(SensorNoise(channel.rms, float(first[0]) if first.size else 0.0))
-    return tuple(found), colours
+        items.append(SensorNoise(channel.rms, float(first[0]) if first.size else 0.0))
+    return tuple(items), colours
 
 
 #: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
@@ -334,15 +334,15 @@ class Separation:
 
     def at(self, record: Signals) -> Point:
         """Return the value and a function of the inputs with its gradient."""
-        found = self._refits(record, self.evaluations)
-        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in found.items()}
+        table = self._refits(record, self.evaluations)
+        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in table.items()}
         total = sum(inverse.values())
-        value = overall([r.distance for r in found.values()])
+        value = overall([r.distance for r in table.values()])
 
         def frozen(other: Signals) -> float:
             plain = [r.predict(other, r.truth) for r in self.rivals]
             moved = 0.0
-            for (a, b), r in found.items():
+            for (a, b), r in table.items():
                 gap = plain[a] - self.rivals[b].predict(other, r.delta)
                 slope = 2.0 * r.difference @ self._white(gap)
                 moved += inverse[a, b] ** 2 / total * float(slope)
@@ -353,8 +353,8 @@ class Separation:
     def distances(self, record: Signals) -> Mapping[tuple[str, str], float]:
         """Return T of every true rival and other one, by their names, fitted to the end."""
         names = [r.name for r in self.rivals]
-        found = self._refits(record, FINAL)
-        return {(names[a], names[b]): r.distance for (a, b), r in found.items()}
+        table = self._refits(record, FINAL)
+        return {(names[a], names[b]): r.distance for (a, b), r in table.items()}
 
     def distance(self, truth: Rival, other: Rival, record: Signals) -> float:
         """Return T of one pair, fitted to the end."""
@@ -364,10 +364,10 @@ class Separation:
     def _refits(self, record: Signals, steps: int) -> dict[tuple[int, int], _Refit]:
         plain = side_by_side(lambda r: r.predict(record, r.truth), self.rivals)
         pairs = list(permutations(range(len(self.rivals)), 2))
-        found = side_by_side(
+        results = side_by_side(
             lambda ab: self._refit(plain[ab[0]], self.rivals[ab[1]], record, steps), pairs
         )
-        return dict(zip(pairs, found, strict=True))
+        return dict(zip(pairs, results, strict=True))
 
     def _refit(self, target: FloatArray, rival: Rival, record: Signals, evaluations: int) -> _Refit:
         """Fit a rival again to a target (n, m), held by what is known of it."""
@@ -383,18 +383,18 @@ class Separation:
             return residual, np.vstack([self._white(jacobian), root])
 
         start = np.zeros(rival.size)
-        found = minimise(
+        minimum = minimise(
             evaluate, start, rival.bounds(), tolerance=_SETTLED, evaluations=evaluations
         )
-        if found is None:
+        if minimum is None:
             raise SimulationError(
                 f"The model with {rival.name} cannot follow a planned input; its values are far"
                 " from physical ones."
             )
-        return _Refit(found.cost, found.theta, -found.residual[: target.size])
+        return _Refit(minimum.cost, minimum.theta, -minimum.residual[: target.size])
 
-    def _white(self, shown: FloatArray) -> FloatArray:
-        return whitened(self.noise, shown)
+    def _white(self, values: FloatArray) -> FloatArray:
+        return whitened(self.noise, values)
 
 
 def overall(distances: Collection[float]) -> float:
@@ -454,9 +454,9 @@ class Information:
     def standard_errors(self, record: Signals | None) -> Mapping[str, float]:
         """Return the standard error of every chosen parameter, in its own unit."""
         slopes = np.abs(np.diag(self.rival.unknowns.slopes(self.rival.theta)))
-        own = np.sqrt(np.diag(self.covariance(record)))
+        item = np.sqrt(np.diag(self.covariance(record)))
         return {
-            n: float(e * slopes[k]) for n, e, k in zip(self.names, own, self._chosen, strict=True)
+            n: float(e * slopes[k]) for n, e, k in zip(self.names, item, self._chosen, strict=True)
         }
 
 

@@ -230,20 +230,20 @@ def usual_inputs(limits: Mapping[str, Limits]) -> dict[str, dict[str, FloatArray
 
     Those of a second input and further ones are slower, so that they can be told apart.
     """
-    found: dict[str, dict[str, FloatArray]] = {"sine": {}, "triangle": {}}
-    for k, (name, own) in enumerate(limits.items()):
-        time, first, share = own.grid(), rest_of(own), own.rest_share
-        fastest = own.rate / (np.pi * own.span)
-        frequency = min(USUAL_PERIODS / (own.duration - first), own.band, fastest) / _APART**k
+    table: dict[str, dict[str, FloatArray]] = {"sine": {}, "triangle": {}}
+    for k, (name, item) in enumerate(limits.items()):
+        time, first, share = item.grid(), rest_of(item), item.rest_share
+        fastest = item.rate / (np.pi * item.span)
+        frequency = min(USUAL_PERIODS / (item.duration - first), item.band, fastest) / _APART**k
         moving = time[time >= first] - first
-        rest = np.full(len(time) - len(moving), own.low + share * own.span)
+        rest = np.full(len(time) - len(moving), item.low + share * item.span)
         for shape, wave, phase in (
             ("sine", sine, np.arccos(1.0 - 2.0 * share) / (2.0 * np.pi)),
             ("triangle", triangle, 0.5 * share),
         ):
-            wound = wave(moving + phase / frequency, own.low, own.high, frequency)
-            found[shape][name] = np.concatenate([rest, wound])
-    return found
+            wound = wave(moving + phase / frequency, item.low, item.high, frequency)
+            table[shape][name] = np.concatenate([rest, wound])
+    return table
 
 
 Limited = Limits | Mapping[str, Limits]
@@ -286,12 +286,12 @@ def _plan(model: Model, limits: Limited, noise: Noisy) -> _Plan:
                 f"There are limits of '{name}', which is no input of '{model.name}'; it has"
                 f" {quoted(model.input_names)}."
             )
-    lengths = {(own.duration, own.samples) for own in every.values()}
+    lengths = {(item.duration, item.samples) for item in every.values()}
     if len(lengths) != 1:
         problems.add("Give limits of an input or more, all with one duration and one `samples`.")
     problems.raise_if_any()
     capacitance = model.values.get("C_p") if is_stack(model) else None
-    steep = {n: replace(own, rate=own.steepest(capacitance)) for n, own in every.items()}
+    steep = {n: replace(item, rate=item.steepest(capacitance)) for n, item in every.items()}
     make, waves = record_for(model), usual_inputs(steep)
     time = next(iter(every.values())).grid()
     usual = {n: make(n, time, columns) for n, columns in waves.items()}
@@ -329,19 +329,19 @@ def separating_experiment(
     progress("comparing with a sine and a triangle")
     criterion = Separation(tuple(rivals), plan.colours(_FINE))
     records = {n: plan.coarse(r) for n, r in {"designed": best.record, **usual}.items()}
-    found = {n: criterion.distances(r) for n, r in records.items()}
-    chosen = max(found, key=lambda n: overall(found[n].values()))
+    table = {n: criterion.distances(r) for n, r in records.items()}
+    chosen = max(table, key=lambda n: overall(table[n].values()))
     if chosen != "designed":
-        records["designed"], found["designed"] = records[chosen], found[chosen]
-    chances = {n: chances_of(criterion, found[n], base, r) for n, r in records.items()}
+        records["designed"], table["designed"] = records[chosen], table[chosen]
+    chances = {n: chances_of(criterion, table[n], base, r) for n, r in records.items()}
     return Separated(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
         limits=plan.limits,
         rivals=tuple(rivals),
         pairs=tuple(
-            Pair(a, b, 0.5 * t, {n: 0.5 * found[n][a, b] for n in usual})
-            for (a, b), t in found["designed"].items()
+            Pair(a, b, 0.5 * t, {n: 0.5 * table[n][a, b] for n in usual})
+            for (a, b), t in table["designed"].items()
         ),
         chance=chances["designed"],
         usual_chance={n: chances[n] for n in usual},
@@ -416,13 +416,13 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    told, _ = one_of_each(d.contenders, d.experiments)
-    if len(told) < 2 or (limits is not None and not _slow(limits)):
-        told = d.contenders  # a new record that shows resonances may tell
-    told = tuple(sorted(told, key=lambda c: -c.evidence)[:_RIVALS])
+    output, _ = one_of_each(d.contenders, d.experiments)
+    if len(output) < 2 or (limits is not None and not _slow(limits)):
+        output = d.contenders  # a new record that shows resonances may tell
+    output = tuple(sorted(output, key=lambda c: -c.evidence)[:_RIVALS])
     best = min(d.contenders, key=lambda c: c.fit.rms).fit
     noise, colours = noise_of_fit(best)
-    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence) for c in told]
+    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence) for c in output]
     base = rival_of_fit("base", d.base_fit, colours)
     chosen = limits or limits_of([e.record for e in d.experiments])
     return separating_experiment(
@@ -440,8 +440,8 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str], **word
     if extended.values[gain.name] == 0.0:
         size = ORDINARY * gain.typical(extended.values)
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
-    own = [n for n in effect.fitted if n not in free]
-    return rival_of_model(effect.name, extended, [*free, *own], **words)
+    items = [n for n in effect.fitted if n not in free]
+    return rival_of_model(effect.name, extended, [*free, *items], **words)
 
 
 def _slow(limits: Limits) -> bool:
@@ -450,12 +450,12 @@ def _slow(limits: Limits) -> bool:
 
 def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Return 95 % intervals as those of a fit, of which nothing lies outside the bounds."""
-    found = {}
+    table = {}
     for name, error in errors.items():
         value, half, p = rival.model.values[name], _SURE * error, rival.model.parameter(name)
         low, high = value - half, value + half
         if p.log and value > 0.0:
             factor = math.exp(min(half / value, 50.0))
             low, high = value / factor, value * factor
-        found[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
-    return found
+        table[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
+    return table

@@ -114,14 +114,14 @@ def limits_of(records: Sequence[Record], **changes: float | None) -> Limits:
     `changes` replace fields that are not None.
     """
     longest = max(records, key=lambda r: r.duration)
-    own: dict[str, Any] = {
+    table: dict[str, Any] = {
         "low": min(float(np.min(r.voltage)) for r in records),
         "high": max(float(np.max(r.voltage)) for r in records),
         "duration": longest.duration * longest.n / (longest.n - 1),
         "samples": longest.n,
     }
-    own |= {name: value for name, value in changes.items() if value is not None}
-    return Limits(**own | {"samples": int(own["samples"])})
+    table |= {name: value for name, value in changes.items() if value is not None}
+    return Limits(**table | {"samples": int(table["samples"])})
 
 
 Kind = Literal["free", "triangles", "steps", "multisine"]
@@ -170,11 +170,11 @@ class Drive:
 
     def columns(self, p: FloatArray, time: FloatArray) -> dict[str, FloatArray]:
         """Return the inputs (n,) at instants [s] by name."""
-        return {n: w.values(own, time) for (n, w), own in self._parts(p)}
+        return {n: w.values(item, time) for (n, w), item in self._parts(p)}
 
     def slack(self, p: FloatArray) -> FloatArray:
         """Return the slack of all waveforms."""
-        return np.concatenate([w.slack(own) for (_, w), own in self._parts(p)])
+        return np.concatenate([w.slack(item) for (_, w), item in self._parts(p)])
 
     def _parts(self, p: FloatArray) -> Iterator[tuple[tuple[str, Waveform], FloatArray]]:
         ends = np.cumsum([len(w.start) for w in self.waves.values()])
@@ -223,12 +223,12 @@ def _reachable(
     levels: FloatArray, durations: FloatArray, per_second: float, now: float
 ) -> FloatArray:
     """Return levels whose changes the rate allows, from `now`, each moved as little as needed."""
-    found = np.empty_like(levels)
+    values = np.empty_like(levels)
     for k, (level, duration) in enumerate(zip(levels, durations, strict=True)):
         now += float(np.clip(level - now, -0.999 * per_second * duration,
                              0.999 * per_second * duration))  # fmt: skip
-        found[k] = now
-    return found
+        values[k] = now
+    return values
 
 
 def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
@@ -254,9 +254,9 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
         levels, durations = p[:count], durations_of(p)
         ends = first + np.cumsum(durations)
         if kind == "steps":
-            begins = ends - durations
-            tops = begins + moving(durations)
-            nodes = np.concatenate([[0.0], np.column_stack([begins, tops]).ravel(), ends[-1:]])
+            starts = ends - durations
+            tops = starts + moving(durations)
+            nodes = np.concatenate([[0.0], np.column_stack([starts, tops]).ravel(), ends[-1:]])
             before = np.concatenate([[rest], levels[:-1]])
             heights = np.column_stack([before, levels]).ravel()
             heights = np.concatenate([[rest], heights, levels[-1:]])

@@ -109,16 +109,16 @@ def design_experiment(
         model, limits, records=records, separate=separate, parameters=parameters, free=free,
         zeros=zeros, hold=hold, known_start=known_start, progress=progress,
     )  # fmt: skip
-    told = left if noise is None else None
-    told = told or noise_of(rivals[0], limits, noise, correlation)
+    output = left if noise is None else None
+    output = output or noise_of(rivals[0], limits, noise, correlation)
     ready = _resting(model, limits)
     if not separate:
         return informative_experiment(
-            rivals[0], told, ready, names=parameters, optimality=optimality, kinds=kinds,
+            rivals[0], output, ready, names=parameters, optimality=optimality, kinds=kinds,
             effort=effort, progress=progress,
         )  # fmt: skip
     return separating_experiment(
-        rivals, told, ready, base=base, kinds=kinds, effort=effort, progress=progress
+        rivals, output, ready, base=base, kinds=kinds, effort=effort, progress=progress
     )
 
 
@@ -126,8 +126,8 @@ def _resting(model: Model, limits: Mapping[str, Limits]) -> dict[str, Limits]:
     """Return the limits with where the inputs rest: a stack's at the lowest voltage."""
     starts = {} if is_stack(model) else {i.name: i.start for i in model.structure.inputs}
     return {
-        n: own if own.rest is not None else replace(own, rest=starts.get(n))
-        for n, own in limits.items()
+        n: item if item.rest is not None else replace(item, rest=starts.get(n))
+        for n, item in limits.items()
     }
 
 
@@ -149,23 +149,23 @@ def noise_of(
                 f" {{'{names[0]}': {noise:g}, ...}}."
             )
         noise = {names[0]: float(noise)}
-    own = dict(noise or {})
-    for name, rms in own.items():
+    item = dict(noise or {})
+    for name, rms in item.items():
         if name not in names or not rms > 0.0:
             raise InputError(
                 f"The noise of '{name}' is given as {rms:g}; give a positive rms of one of"
                 f" {', '.join(names)}."
             )
-    if len(own) < len(names):
+    if len(item) < len(names):
         some = next(iter(limits.values()))
         time = some.grid(_RAMP)
         ramps = {n: each.low + each.span * time / time[-1] for n, each in limits.items()}
-        shown = rival.predict(record_for(rival.model)("ramp", time, ramps), rival.truth)
+        displayed = rival.predict(record_for(rival.model)("ramp", time, ramps), rival.truth)
         sizes = dict(zip(rival.model.output_names, rival.model.output_nominals(), strict=True))
-        for name, y in zip(names, shown.T, strict=True):
+        for name, y in zip(names, displayed.T, strict=True):
             moved = float(np.ptp(y))
-            own.setdefault(name, NOISE_SHARE * (moved or float(sizes[name])))
-    return tuple(SensorNoise(own[n], correlation) for n in names)
+            item.setdefault(name, NOISE_SHARE * (moved or float(sizes[name])))
+    return tuple(SensorNoise(item[n], correlation) for n in names)
 
 
 def rivals_of(
@@ -229,25 +229,27 @@ def _of_a_stack(
 ) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
     free = [n for n in CORE if n in model.parameter_names]
     if not separate:
-        own = [n for e in model.effects for n in e.fitted]
-        names = dict.fromkeys([*free, *own, *(n for n in parameters if n in model.parameter_names)])
+        items = [n for e in model.effects for n in e.fitted]
+        names = dict.fromkeys(
+            [*free, *items, *(n for n in parameters if n in model.parameter_names)]
+        )
         return [rival_of_model(model.name, model, tuple(names))], None, None
     effects = [EFFECTS[e] if isinstance(e, str) else e for e in separate]
     if records is not None:
-        base, found, _ = fit_contenders(records, effects, model=model, progress=progress)
-        return _fitted(base, found, {})
+        base, result, _ = fit_contenders(records, effects, model=model, progress=progress)
+        return _fitted(base, result, {})
     plain = model.without(e.name for e in effects)
     free = [n for n in free if n in plain.parameter_names]
     return [rival_of_effect(model, e, free) for e in effects], None, None
 
 
 def _fitted(
-    base: Fit, found: Sequence[Contender], words: dict[str, Any]
+    base: Fit, contenders: Sequence[Contender], words: dict[str, Any]
 ) -> tuple[list[Rival], Rival, tuple[SensorNoise, ...]]:
     """Return rivals that were fitted to records, the base, and the noise that the best leaves."""
-    best = min(found, key=lambda c: c.fit.cost if words else c.fit.rms).fit
+    best = min(contenders, key=lambda c: c.fit.cost if words else c.fit.rms).fit
     noise, colours = noise_of_fit(best)
-    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence, **words) for c in found]
+    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence, **words) for c in contenders]
     return rivals, rival_of_fit("base", base, colours, **words), noise
 
 
@@ -270,16 +272,16 @@ def _attached(
     else:
         sizes = sizes_of(base.model, runs, base.starts())
     table = {e.name: e for e in effects_of(model, sizes)}
-    found = []
+    items = []
     for effect in separate:
         if isinstance(effect, Component):
-            found.append(of_ones_own(model, effect))
+            items.append(of_ones_own(model, effect))
         elif effect in table:
-            found.append(table[effect])
+            items.append(table[effect])
         else:
             near = get_close_matches(effect, table, 3, 0.3) or list(table)[:3]
             raise InputError(
                 f"There is no effect '{effect}' of the model '{model.name}'; of {len(table)} the"
                 f" nearest are {', '.join(near)}."
             )
-    return found
+    return items

@@ -74,9 +74,11 @@ def search(
     problem, rng = _Problem(criterion, limits, make), np.random.default_rng(effort.seed)
     # no faster than the grid of the comparison can show
     rate = len(problem.time) / problem.limits.duration
-    slower = {n: replace(own, bandwidth=min(own.band, rate / _CYCLE)) for n, own in limits.items()}
+    slower = {
+        n: replace(item, bandwidth=min(item.band, rate / _CYCLE)) for n, item in limits.items()
+    }
     pool = [
-        Drive(kind, {n: draw(kind, own, own.rate, rng) for n, own in slower.items()})
+        Drive(kind, {n: draw(kind, item, item.rate, rng) for n, item in slower.items()})
         for kind in kinds
         for _ in range(effort.draws)
     ]
@@ -88,17 +90,17 @@ def search(
             "None of the drawn inputs could be simulated with the models; parameter values far"
             " from physical ones are the likely cause: check them."
         )
-    best, found, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
+    best, result, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
     for number, k in enumerate(order[: effort.starts]):
-        if better and enough(problem.record(*found)):
+        if better and enough(problem.record(*result)):
             break
         progress(f"improving {number + 1} of {effort.starts}: {pool[k].kind}")
         p, value = problem.improve(pool[k], effort.steps)
         better = value > best
         if better:
-            best, found = value, (pool[k], p)
-    record = replace(problem.record(*found, problem.limits.grid()), name="designed")
-    kind = str(found[0].kind)
+            best, result = value, (pool[k], p)
+    record = replace(problem.record(*result, problem.limits.grid()), name="designed")
+    kind = str(result[0].kind)
     for other in usual:
         value = problem.of(coarse(other, len(problem.time), make)).value
         if value > best:

@@ -110,8 +110,8 @@ def mechanical_poles(mechanics: Mechanics, mounting: Mounting) -> ComplexArray:
     """Return the roots of D + M H [rad/s], slowest first."""
     unit = mechanics.frequency
     scaled = in_units(closed_polynomial(mechanics, mounting), unit)
-    found = np.roots(scaled / np.max(np.abs(scaled))) * unit
-    roots: ComplexArray = np.asarray(found, dtype=np.complex128)
+    result = np.roots(scaled / np.max(np.abs(scaled))) * unit
+    roots: ComplexArray = np.asarray(result, dtype=np.complex128)
     return roots[np.argsort(np.abs(roots), kind="stable")]
 
 

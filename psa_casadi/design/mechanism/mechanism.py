@@ -154,14 +154,14 @@ def design_mechanism(
     """
     check_goals(damping, bandwidth, poles, limits, starts)
     mechanics = mechanics_of(model, acts_on)
-    found = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
-    best = found[0]
+    result = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
+    best = result[0]
     if not best.converged:
         raise InputError(
-            f"None of {len(found)} searches for a mechanism ended well; the limits exclude each"
+            f"None of {len(result)} searches for a mechanism ended well; the limits exclude each"
             " other, or the goals are far from what the stack can do: widen the limits."
         )
-    agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in found)
+    agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in result)
     mounting, free = best.mounting, Mounting(0.0, 0.0, 0.0)
     reached, closed = _measured(mechanics, mounting), mechanical_poles(mechanics, mounting)
     goals, attained = [], True
@@ -178,7 +178,7 @@ def design_mechanism(
         mechanics, mounting, acts_on, tuple(goals), limits, poles=closed,
         free_poles=mechanical_poles(mechanics, free), lag_pole=-1.0 / mechanics.lag,
         reached=reached, free=_measured(mechanics, free), attained=attained,
-        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(found),
+        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(result),
     )  # fmt: skip
 
 
@@ -259,7 +259,7 @@ def _binding(m: Mounting, r: Reached, limits: Limits) -> tuple[str, ...]:
         ("largest mass", m.mass, limits.mass[1]),
         ("largest damping", m.damping, limits.damping[1]),
     )
-    found = [name for name, value, limit in ends if value > 0.99 * limit]
+    items = [name for name, value, limit in ends if value > 0.99 * limit]
     if limits.mass[0] > 0.0 and m.mass < 1.01 * limits.mass[0]:
-        found.append("least mass")
-    return tuple(found)
+        items.append("least mass")
+    return tuple(items)

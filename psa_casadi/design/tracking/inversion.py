@@ -113,9 +113,9 @@ def invert(
         for _ in range(max(trials, 1)):
             free = _voltage(model, even, wanted, rest)
             voltage = held(model, limits, even.time, free)
-            shown = respond(model, even.time, voltage).displacement
-            made.append(_Trial(wanted, voltage, error_of(even, shown)))
-            left = np.where(voltage == free, even.displacement - shown, 0.0)
+            displayed = respond(model, even.time, voltage).displacement
+            made.append(_Trial(wanted, voltage, error_of(even, displayed)))
+            left = np.where(voltage == free, even.displacement - displayed, 0.0)
             felt.append(float(np.linalg.norm(left)))
             if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
                 break
@@ -182,11 +182,11 @@ def _voltage(model: Model, even: Target, wanted: FloatArray, rest: float) -> Flo
         constant, dt, n = p["R_s"] * p["C_p"], even.step / _PARTS, len(wanted)
         fine = np.interp(np.arange((n - 1) * _PARTS + 1) / _PARTS, np.arange(n), wanted)
         # the drive's exact answer to a line through samples, from rest
-        given, decay = p["G"] * fine, np.exp(-dt / constant)
+        inputs, decay = p["G"] * fine, np.exp(-dt / constant)
         later = 1.0 - constant / dt * (1.0 - decay)
         upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
-        state = [given[0] * (1.0 - later)]
-        behind = scipy.signal.lfilter(upper, lower, given, zi=state)[0]
+        state = [inputs[0] * (1.0 - later)]
+        behind = scipy.signal.lfilter(upper, lower, inputs, zi=state)[0]
         march = _march(model).mapaccum("march", len(fine) - 1)
         u = np.array(march(ca.DM([behind[0], 0.0]), np.diff(behind)[None, :], dt)).T
         u = np.concatenate([[behind[0]], u[:, 0]])
@@ -275,15 +275,15 @@ def _check(target: Target, record: Record) -> None:
             f"{name}: lasts {record.time[-1] - record.time[0]:.4g} s, the path"
             f" {target.time[-1]:.4g} s; record the whole path, from its first sample on."
         )
-    shown = record.displacement
-    if shown is None or record.displacement_unit != "m" or not np.isfinite(shown).all():
+    displayed = record.displacement
+    if displayed is None or record.displacement_unit != "m" or not np.isfinite(displayed).all():
         problems.add(
             f"{name}: a trial needs a displacement in a unit of length at every sample; fill"
             " the gaps, or convert counts by the sensor's scale."
         )
-    elif np.ptp(shown) < _MOVED * target.span:
+    elif np.ptp(displayed) < _MOVED * target.span:
         problems.add(
-            f"{name}: the stack moved by {1e6 * np.ptp(shown):.3g} um, the path moves by"
+            f"{name}: the stack moved by {1e6 * np.ptp(displayed):.3g} um, the path moves by"
             f" {1e6 * target.span:.3g} um; this is no trial of it, or in another unit."
         )
     problems.raise_if_any()

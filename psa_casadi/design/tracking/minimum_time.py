@@ -77,29 +77,29 @@ class LinearMove:
         xdot, y = m.structure.f(time, arrival, u, m.parameter_vector())
         x = arrival[rows] / size
         rates = np.array(xdot).ravel()[rows] / size - self.a @ x - self.b * last
-        shown = float(y[m.output_names.index("displacement")])
-        return Offsets(state, rates, shown - float(self.c @ x))
+        displayed = float(y[m.output_names.index("displacement")])
+        return Offsets(state, rates, displayed - float(self.c @ x))
 
     def shortest(self, offsets: Offsets) -> tuple[float, FloatArray]:
         """Return the least length [s] by halving, and its voltage (n + 1,) [V]."""
         slowest = float(np.max(1.0 / np.abs(np.linalg.eigvals(self.a))))
         low, high = 0.0, slowest
-        found = self._arrive(high, offsets)
-        while found is None:
+        values = self._arrive(high, offsets)
+        while values is None:
             low, high = high, 2.0 * high
             if high > _PERIODS * slowest:
                 raise PsaError(
                     "No voltage within the limits makes the move; widen them, or move less far."
                 )
-            found = self._arrive(high, offsets)
+            values = self._arrive(high, offsets)
         while high - low > _PRECISION * high:
             middle = 0.5 * (low + high)
             tried = self._arrive(middle, offsets)
             if tried is None:
                 low = middle
             else:
-                high, found = middle, tried
-        return high, np.concatenate([[self.rest], found])
+                high, values = middle, tried
+        return high, np.concatenate([[self.rest], values])
 
     def nearest(self, length: float, voltage: FloatArray, offsets: Offsets) -> FloatArray | None:
         """Return the voltage that arrives and at most differs least from another; None if none."""
@@ -325,9 +325,9 @@ def _play(
     n = len(voltage) - 1
     time: FloatArray = np.asarray(length / n * np.arange(n + 2 + HOLD * n), dtype=float)
     whole = np.concatenate([voltage[:1], voltage, np.full(HOLD * n, voltage[-1])])
-    found = respond(model, time, whole)
-    held, hold = found.displacement[n + 1 :], time[n + 1 :]
+    result = respond(model, time, whole)
+    held, hold = result.displacement[n + 1 :], time[n + 1 :]
     slow = np.polynomial.Polynomial.fit(hold, held, 2)(hold)
     swing, position = float(np.max(np.abs(held - slow))), float(slow[0])
     distance = max(swing, abs(position - end)) / abs(linear.travel)
-    return _Play(length, found, position, swing, distance)
+    return _Play(length, result, position, swing, distance)

@@ -276,12 +276,12 @@ def rest_at(model: Model, displacement: float) -> tuple[float, FloatArray]:
     before, after, size = 0.0, 1.0, model.output_nominals()[row]
     reached = settled(before)[0]
     for _ in range(20):
-        found, x = settled(after)
-        if found == reached or abs(found - displacement) < 1e-9 * size:
+        result, x = settled(after)
+        if result == reached or abs(result - displacement) < 1e-9 * size:
             break
-        slope = (found - reached) / (after - before)
-        before, reached, after = after, found, after + (displacement - found) / slope
-    if not abs(found - displacement) < 1e-6 * size:
+        slope = (result - reached) / (after - before)
+        before, reached, after = after, result, after + (displacement - result) / slope
+    if not abs(result - displacement) < 1e-6 * size:
         raise InputError(
             f"No voltage holds the stack at {1e6 * displacement:g} um; the path is likely in"
             " another unit, or far beyond the stroke: correct it."
@@ -361,8 +361,8 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
         ),
     )
     sentences = []
-    for name, stands, fewest in cases:
-        spans = [(a, b) for a, b in _runs(stands) if b - a + 1 >= fewest]
+    for name, holds, fewest in cases:
+        spans = [(a, b) for a, b in _runs(holds) if b - a + 1 >= fewest]
         if spans:
             times = [(1e3 * response.time[a], 1e3 * response.time[b]) for a, b in spans[:_NAMED]]
             when = " and ".join(f"from {first:.4g} to {last:.4g} ms" for first, last in times)
@@ -373,10 +373,10 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _runs(stands: BoolArray) -> list[tuple[int, int]]:
+def _runs(mask: BoolArray) -> list[tuple[int, int]]:
     """Return first and last sample of every run of True; short gaps do not end one."""
     spans: list[tuple[int, int]] = []
-    for first, stop in runs_of(stands):
+    for first, stop in runs_of(mask):
         if spans and first - spans[-1][1] <= _GAP:
             spans[-1] = (spans[-1][0], stop - 1)
         else:

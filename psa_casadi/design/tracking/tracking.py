@@ -124,9 +124,9 @@ def _at_nodes(
     grid = np.concatenate([time[:1], _nodes(time).T.ravel()])
     u = input_samples(model, len(grid), {"voltage": np.interp(grid, time, voltage)})
     steps = run(model, grid, u, start, rtol=1e-7)
-    shown = steps.y[1:, model.output_names.index("displacement")]
+    displayed = steps.y[1:, model.output_names.index("displacement")]
     states = steps.x[1:] / model.state_nominals()
-    return states.reshape(count, -1).T, shown.reshape(count, 2).T
+    return states.reshape(count, -1).T, displayed.reshape(count, 2).T
 
 
 def _nodes(time: FloatArray) -> FloatArray:
@@ -219,24 +219,24 @@ class Program:
         high = -low
         free = slice(inner.size, inner.size + len(voltage) - 2)
         low[free], high[free] = q.limits.min_voltage / q.scale, q.limits.max_voltage / q.scale
-        found = self._solver(
+        result = self._solver(
             x0=np.concatenate(guess), p=path.T.ravel(), lbx=low, ubx=high,
             lbg=self._low, ubg=self._high,
         )  # fmt: skip
         raise_if_stopped()  # which the solver takes for a failure
         stats = self._solver.stats()
-        off = np.maximum(np.array(found["g"]).ravel() - self._high, 0.0)
+        off = np.maximum(np.array(result["g"]).ravel() - self._high, 0.0)
         if not stats["success"] and not np.max(off) < _FEASIBLE:
             raise NoSolutionError(
                 f"IPOPT found no voltage ({stats['return_status']}). Limits that leave the path no"
                 " room, or a path far beyond the stack's bandwidth, are the likely cause; widen"
                 " the limits or slow the path down."
             )
-        x = np.array(found["x"]).ravel()
+        x = np.array(result["x"]).ravel()
         return Solution(
             np.concatenate([[q.rest, q.rest], q.scale * x[free]]),
             x[: inner.size].reshape(inner.T.shape).T,
-            np.array(self._outputs(found["x"])),
+            np.array(self._outputs(result["x"])),
             int(stats["iter_count"]),
             bool(stats["success"]),
         )
@@ -356,7 +356,7 @@ def track(
     Raises InputError for a model that is no stack, limits that contradict each other or the path's
     start, and PsaError if no voltage within the limits is found.
     """
-    begun = clocks.perf_counter()
+    started = clocks.perf_counter()
     bounds = limits or AmplifierLimits()
     rest, start = _rest(model, target, bounds)
     progress("inversion")
@@ -375,7 +375,7 @@ def track(
     designed = _chosen(model, target, bounds, minimax, solutions, cut)
     return TrackedInput(
         target, bounds, minimax, *designed, width, inverse,
-        sum(s.iterations for _, s in solutions), clocks.perf_counter() - begun,
+        sum(s.iterations for _, s in solutions), clocks.perf_counter() - started,
     )  # fmt: skip
 
 
@@ -438,19 +438,19 @@ def _solve(
     between = scipy.interpolate.PchipInterpolator(target.time, target.displacement)
     path = np.asarray(between(_nodes(target.time)))
     start = problem.start * problem.interval.nominal
-    program, shown = Program(problem), path
+    program, displayed = Program(problem), path
     inner, _ = _at_nodes(smooth, target.time, guess, start)
     solutions: list[tuple[float, Solution]] = []
     for count in range(corrections + 1):
         progress(f"solution {count + 1} of {corrections + 1}")
         try:
-            found = program.solve(shown, guess, inner)
+            result = program.solve(displayed, guess, inner)
         except NoSolutionError:
             break
-        _, reached = _at_nodes(model, target.time, found.voltage, start)
+        _, reached = _at_nodes(model, target.time, result.voltage, start)
         off = np.abs(reached - path)
         size = np.max(off) if problem.minimax else np.sqrt(np.mean(off**2))
-        solutions.append((float(size), found))
-        guess, inner = found.voltage, found.inner
-        shown = path - (reached - found.displacement)
+        solutions.append((float(size), result))
+        guess, inner = result.voltage, result.inner
+        displayed = path - (reached - result.displacement)
     return solutions

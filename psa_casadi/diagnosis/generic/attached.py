@@ -82,8 +82,8 @@ def at_port(
     """
 
     def equations(s: Symbols) -> Equations:
-        found = law(s, lambda short: getattr(s, f"{name}_{short}"))
-        der, term = found if isinstance(found, tuple) else ({}, found)
+        result = law(s, lambda short: getattr(s, f"{name}_{short}"))
+        der, term = result if isinstance(result, tuple) else ({}, result)
         return Equations(
             der={f"{name}_{short}": rate for short, rate in der.items()},
             add={port.balance: term},
@@ -125,8 +125,8 @@ def of_ones_own(model: Model, component: Component) -> Attached:
             f" add to one of {', '.join(ports)}, and name a parameter as its gain."
         )
     reads = tuple(p for name, p in ports.items() if name in symbols.made and p not in added)
-    told = replace(component, description=f"{added[0].words}: {component.description}")
-    return Attached(told, added[0], (*added[1:], *reads))
+    output = replace(component, description=f"{added[0].words}: {component.description}")
+    return Attached(output, added[0], (*added[1:], *reads))
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:

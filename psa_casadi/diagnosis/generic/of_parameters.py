@@ -22,21 +22,21 @@ def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     states = [q.name for c in model.components if c.gain is None for q in c.states]
     known = {i.name: i.unit for i in model.structure.inputs}
     marked = [p for p in ports_of(model) if p.kind == "intermediate"]
-    found: list[Attached] = []
+    attacheds: list[Attached] = []
     for port in (*parameter_ports(model), *marked):
-        found += [_with(port, x, unit_of(model, x), sizes.signals[x]) for x in states]
-        found += [_with(port, u, unit, sizes.signals[u]) for u, unit in known.items()]
-        found.append(_with(port, "time", "s", sizes.duration))
-    return tuple(found)
+        attacheds += [_with(port, x, unit_of(model, x), sizes.signals[x]) for x in states]
+        attacheds += [_with(port, u, unit, sizes.signals[u]) for u, unit in known.items()]
+        attacheds.append(_with(port, "time", "s", sizes.duration))
+    return tuple(attacheds)
 
 
 def _with(port: Port, x: str, unit: str, size: float) -> Attached:
     p = port.variable if port.kind == "parameter" else true_sum(port.variable)
 
-    def law(s: Symbols, own: Own) -> Expression:
-        part = getattr(s, x) / own("range")
-        curve = ca.cos(own("angle")) * part + ca.sin(own("angle")) * part**2
-        return own("size") * getattr(s, p) * curve
+    def law(s: Symbols, item: Own) -> Expression:
+        part = getattr(s, x) / item("range")
+        curve = ca.cos(item("angle")) * part + ca.sin(item("angle")) * part**2
+        return item("size") * getattr(s, p) * curve
 
     return at_port(
         port, f"change_of_{port.variable}_with_{x}", law,

@@ -46,16 +46,16 @@ def sum_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
 
     Of an intermediate, what is no coordinate may be lost by; a rate is lost by its own state.
     """
-    own = [port.variable] if port.kind == "rate" else []
-    seen = [n for n in seen_by(model, port) if n not in model.input_names]
-    ways = [n for n in seen if n not in own and not _way(model, n)[1]]
-    losing = own or [n for n in seen if n not in ways]
+    item = [port.variable] if port.kind == "rate" else []
+    items = [n for n in seen_by(model, port) if n not in model.input_names]
+    ways = [n for n in items if n not in item and not _way(model, n)[1]]
+    losing = item or [n for n in items if n not in ways]
     # a hysteresis works along coordinates, else along all that is seen
     return (
         _constant(model, port, sizes),
         *(make(model, port, sizes, n) for n in losing for make in (_loss, _friction, _drag)),
-        *(make(model, port, sizes, n) for n in seen for make in (_curve, _stop)),
-        *(_hysteresis(model, port, sizes, n) for n in ways or seen),
+        *(make(model, port, sizes, n) for n in items for make in (_curve, _stop)),
+        *(_hysteresis(model, port, sizes, n) for n in ways or items),
     )
 
 
@@ -72,13 +72,13 @@ def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[Port, 
 
 
 def _name(kind: str, port: Port, q: str) -> str:
-    own = port.kind == "rate" and q == port.variable
-    return f"{kind}_in_{q}" if own else f"{kind}_of_{q}_in_{port.variable}"
+    item = port.kind == "rate" and q == port.variable
+    return f"{kind}_in_{q}" if item else f"{kind}_of_{q}_in_{port.variable}"
 
 
 def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
     return at_port(
-        port, f"constant_in_{port.variable}", lambda s, own: own("size"),
+        port, f"constant_in_{port.variable}", lambda s, item: item("size"),
         gain="size",
         words=(
             "a constant is missing",
@@ -92,7 +92,7 @@ def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
 
 def _loss(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
     return at_port(
-        port, _name("loss", port, v), lambda s, own: -own("size") * getattr(s, v) / own("range"),
+        port, _name("loss", port, v), lambda s, item: -item("size") * getattr(s, v) / item("range"),
         gain="size",
         words=(
             f"it loses in proportion to {v}",
@@ -110,9 +110,9 @@ def _loss(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
 def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
     size = rounded(sizes.signals[v])
 
-    def law(s: Symbols, own: Own) -> Expression:
+    def law(s: Symbols, item: Own) -> Expression:
         state = getattr(s, v)
-        return -own("size") * state / ca.sqrt(state**2 + own("width") ** 2)
+        return -item("size") * state / ca.sqrt(state**2 + item("width") ** 2)
 
     return at_port(
         port, _name("friction", port, v), law,
@@ -137,9 +137,9 @@ def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
 
 
 def _drag(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
-    def law(s: Symbols, own: Own) -> Expression:
-        part = getattr(s, v) / own("range")
-        return -own("size") * part * smooth_magnitude(part, _STILL)
+    def law(s: Symbols, item: Own) -> Expression:
+        part = getattr(s, v) / item("range")
+        return -item("size") * part * smooth_magnitude(part, _STILL)
 
     return at_port(
         port, _name("drag", port, v), law,
@@ -160,7 +160,7 @@ def _drag(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
 def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     return at_port(
         port, f"curve_of_{x}_in_{port.variable}",
-        lambda s, own: own("size") * bent(getattr(s, x) / own("range"), own("angle")),
+        lambda s, item: item("size") * bent(getattr(s, x) / item("range"), item("angle")),
         gain="size",
         words=(
             f"it depends on {x} along a curve",
@@ -180,9 +180,9 @@ def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
 def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     force, size = size_at(port, sizes), rounded(sizes.signals[x])
 
-    def law(s: Symbols, own: Own) -> Expression:
-        excess = beyond(getattr(s, x), own("level"), _CORNER * own("range"))
-        return -own("size") * excess / own("range")
+    def law(s: Symbols, item: Own) -> Expression:
+        excess = beyond(getattr(s, x), item("level"), _CORNER * item("range"))
+        return -item("size") * excess / item("range")
 
     return at_port(
         port, f"stop_of_{x}_in_{port.variable}", law,
@@ -212,13 +212,13 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     """
     (parts, reads), force = _way(model, x), size_at(port, sizes)
 
-    def law(s: Symbols, own: Own) -> Terms:
+    def law(s: Symbols, item: Own) -> Terms:
         rate = sum(factor * getattr(s, speed) for speed, factor in parts)
-        w, z = rate / own("range"), own("state")
-        size = smooth_magnitude(w, _STILL * own("rate") / own("range"))
-        power, signed = magnitude_power(z, own("n")), signed_power(z, own("n"))
-        der = w * (1 - own("bend") * power) - own("loss") * size * signed
-        return {"state": der}, -own("size") * z
+        w, z = rate / item("range"), item("state")
+        size = smooth_magnitude(w, _STILL * item("rate") / item("range"))
+        power, signed = magnitude_power(z, item("n")), signed_power(z, item("n"))
+        der = w * (1 - item("bend") * power) - item("loss") * size * signed
+        return {"state": der}, -item("size") * z
 
     return at_port(
         port, f"hysteresis_of_{x}_in_{port.variable}", law,
@@ -253,10 +253,10 @@ def _range(model: Model, sizes: Sizes, x: str) -> Parameter:
 
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return every generic effect at every port of a model that has no effects yet."""
-    found, imported = list[Attached](), bool(model.structure.foreign)
+    result, imported = list[Attached](), bool(model.structure.foreign)
     for port in ports_of(model):
         if port.kind != "rate":
-            found += signal_effects(port, sizes, imported=imported)
+            result += signal_effects(port, sizes, imported=imported)
         if port.kind == "rate" or is_place(model, port):
-            found += sum_effects(model, port, sizes)
-    return (*found, *changing(model, sizes))
+            result += sum_effects(model, port, sizes)
+    return (*result, *changing(model, sizes))

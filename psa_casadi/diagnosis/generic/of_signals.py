@@ -68,7 +68,7 @@ def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
     return at_port(
         port,
         f"{kind}_of_{port.variable}",
-        lambda s, own: law(s, getattr(s, signal), own),
+        lambda s, item: law(s, getattr(s, signal), item),
         belongs_to=_PLACE[port.kind],
         signal=signal,
         **more,
@@ -76,9 +76,9 @@ def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
 
 
 def _lag(port: Port, sizes: Sizes) -> Attached:
-    def law(s: Symbols, q: Expression, own: Own) -> Terms:
-        time, behind = own("time") + own("floor"), own("state") - q
-        return {"state": -behind / time}, own("time") / time * behind
+    def law(s: Symbols, q: Expression, item: Own) -> Terms:
+        time, behind = item("time") + item("floor"), item("state") - q
+        return {"state": -behind / time}, item("time") / time * behind
 
     return _made(
         port, "lag", law,
@@ -96,10 +96,10 @@ def _lag(port: Port, sizes: Sizes) -> Attached:
 
 
 def _delay(port: Port, sizes: Sizes) -> Attached:
-    def law(s: Symbols, q: Expression, own: Own) -> Terms:
-        half, floor = own("time") / 2, own("floor")
-        a1, b1, first = pade_section(half, floor, q, own("a1"), own("b1"))
-        a2, b2, second = pade_section(half, floor, first, own("a2"), own("b2"))
+    def law(s: Symbols, q: Expression, item: Own) -> Terms:
+        half, floor = item("time") / 2, item("floor")
+        a1, b1, first = pade_section(half, floor, q, item("a1"), item("b1"))
+        a2, b2, second = pade_section(half, floor, first, item("a2"), item("b2"))
         return {"a1": a1, "b1": b1, "a2": a2, "b2": b2}, second - q
 
     size = _size(port, sizes)
@@ -123,7 +123,7 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
 
 def _gain(port: Port, sizes: Sizes) -> Attached:
     return _made(
-        port, "gain", lambda s, q, own: own("size") * q,
+        port, "gain", lambda s, q, item: item("size") * q,
         gain="size",
         words=(
             "its gain is another one",
@@ -140,10 +140,10 @@ def _gain(port: Port, sizes: Sizes) -> Attached:
 def _backlash(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
 
-    def law(s: Symbols, q: Expression, own: Own) -> Terms:
-        behind = q - own("state")
-        pushed = beyond(behind, own("width"), own("corner"))
-        return {"state": pushed / own("floor")}, -own("gain") * behind
+    def law(s: Symbols, q: Expression, item: Own) -> Terms:
+        behind = q - item("state")
+        pushed = beyond(behind, item("width"), item("corner"))
+        return {"state": pushed / item("floor")}, -item("gain") * behind
 
     words = "width over which the corner is rounded, a scale only"
     return _made(
@@ -172,7 +172,7 @@ def _backlash(port: Port, sizes: Sizes) -> Attached:
 def _bend(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
     return _made(
-        port, "bend", lambda s, q, own: own("size") * bent(q / own("range"), own("angle")),
+        port, "bend", lambda s, q, item: item("size") * bent(q / item("range"), item("angle")),
         gain="size",
         words=(
             "its gain depends on its level",
@@ -193,7 +193,7 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
     return _made(
         port, "saturation",
-        lambda s, q, own: -own("gain") * beyond(q, own("level"), own("corner")),
+        lambda s, q, item: -item("gain") * beyond(q, item("level"), item("corner")),
         gain="gain",
         words=(
             "it goes no further than a level, to either side",
@@ -215,7 +215,7 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
     lost = "share of the small values that is lost"
     return _made(
         port, "dead_zone",
-        lambda s, q, own: -own("gain") * (q - beyond(q, own("level"), own("corner"))),
+        lambda s, q, item: -item("gain") * (q - beyond(q, item("level"), item("corner"))),
         gain="gain",
         words=(
             "small values of it do nothing",
@@ -235,7 +235,7 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
 def _zero(port: Port, sizes: Sizes) -> Attached:
     shift = replace(size_of(port.unit, _size(port, sizes), "shift of the zero"), name="shift")
     return _made(
-        port, "zero", lambda s, q, own: own("shift"),
+        port, "zero", lambda s, q, item: item("shift"),
         gain="shift",
         words=(
             "its zero is shifted",
@@ -249,7 +249,7 @@ def _zero(port: Port, sizes: Sizes) -> Attached:
 
 def _drift(port: Port, sizes: Sizes) -> Attached:
     return _made(
-        port, "drift", lambda s, q, own: own("size") * s.time / own("duration"),
+        port, "drift", lambda s, q, item: item("size") * s.time / item("duration"),
         gain="size",
         words=(
             "its zero drifts with time",

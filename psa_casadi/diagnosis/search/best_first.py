@@ -139,9 +139,13 @@ class _Search:
             return self.next()
         best = self.known.best()
         way = [self.known.found.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
-        for own in way:
-            if own is not None and (own is best or own.names in self.expanded) and self.unseen(own):
-                return own
+        for item in way:
+            if (
+                item is not None
+                and (item is best or item.names in self.expanded)
+                and self.unseen(item)
+            ):
+                return item
         if best.causes and self.once("exchange", best.names):
             if self.does("exchange"):
                 exchange(best, self.known, self.task)
@@ -155,8 +159,8 @@ class _Search:
 
     def is_small(self, h: Hypothesis) -> bool:
         """Whether causes are so small beside the noise that others may be as likely."""
-        shown = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
-        return bool(h.causes) and shown.known(self.task.limits) < _SURELY
+        displayed = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
+        return bool(h.causes) and displayed.known(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
@@ -243,15 +247,15 @@ class _Search:
         if not names:
             return
         self.tell(h, f"fitting {', '.join(names)}")
-        for found in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
-            self.known.note(found)
+        for result in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
+            self.known.note(result)
         self.known.remember(h, *names)
         best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
         goal = self.known.near(h, best) if best is not None else np.inf
         rest = leading[_PACE:]
         if rest and self.does("other effects"):
-            for found in side_by_side(lambda s: with_cause(h, experiments, s, goal), rest):
-                self.known.note(found)
+            for result in side_by_side(lambda s: with_cause(h, experiments, s, goal), rest):
+                self.known.note(result)
         if "fits afresh" not in task.method.without:
             self.fit_afresh(h, view)
             if self.does("other parents"):
@@ -275,15 +279,15 @@ class _Search:
             return False
         self.shaken[less.names] = less.fit
         self.tell(less, "several modes at once")
-        found = with_modes(less, experiments)
-        if found is None:
+        result = with_modes(less, experiments)
+        if result is None:
             return False
-        self.known.note(found)
+        self.known.note(result)
         single = view.starts_of(name) if less is h else []
         if single:
             self.known.note(with_cause(h, experiments, single))
-        self.known.remember(less, found.causes[-1].name, name)
-        return self.known.best().names == found.names
+        self.known.remember(less, result.causes[-1].name, name)
+        return self.known.best().names == result.names
 
     def several_at_once(self, h: Hypothesis) -> None:
         """Fit sets of causes at once, again where the base without causes has become another."""
@@ -311,10 +315,10 @@ class _Search:
         done = [c.causes[-1].name for c in self.known.children(root)[:_AFRESH]]
         scores = [s for n, s in view.screening.best_by_effect().items() if n not in done]
         self.tell(root, "all other effects afresh")
-        found = any_afresh(root, self.task.experiments, scores)
-        if found is not None:
-            self.known.note(found)
-            self.known.remember(root, found.causes[-1].name)
+        result = any_afresh(root, self.task.experiments, scores)
+        if result is not None:
+            self.known.note(result)
+            self.known.remember(root, result.causes[-1].name)
 
     def challenge(self, h: Hypothesis) -> None:
         """Fit with every cause taken out, and with resonances of the stack's own in its place.
@@ -331,12 +335,12 @@ class _Search:
             self.known.remember(before, STRUCTURAL_MODE.name)
         if before is None or has_series(h) or not self.does("resonances"):
             return
-        last, found = h.causes[-1], None
+        last, fit = h.causes[-1], None
         if rings(last):
-            found = instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
-        if found is None and not before.causes and not self.unseen(before):
-            found = instead_of(before.fit, h.fit, task.experiments, task.progress)
-        self.known.note(hypothesis(before.causes, found, task.experiments, final=True))
+            fit = instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
+        if fit is None and not before.causes and not self.unseen(before):
+            fit = instead_of(before.fit, h.fit, task.experiments, task.progress)
+        self.known.note(hypothesis(before.causes, fit, task.experiments, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
         """Fit with resonances that the base has missed; whether that explains more.
@@ -357,10 +361,10 @@ class _Search:
             return False
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
-        found = from_band(h.fit, experiments, task.progress)
-        own = hypothesis(h.causes, found, experiments, final=True)
-        if own is not None and (h.causes or not examine(own, task, self.known.trials).leaves):
-            self.known.note(own)
+        fit = from_band(h.fit, experiments, task.progress)
+        item = hypothesis(h.causes, fit, experiments, final=True)
+        if item is not None and (h.causes or not examine(item, task, self.known.trials).leaves):
+            self.known.note(item)
         return self.known.found.get(h.names) is not h
 
     def seen_in_records(self) -> bool:

@@ -40,17 +40,17 @@ def quick_fit(
     or that of another start. Where none comes below that without the effect, some more from there,
     with the gain at 0: the loop may be such that no other start of the gain fits to it.
     """
-    found: list[Fit] = []
+    fits: list[Fit] = []
     for values, gain, memory in starts:
-        least = min([goal, before.cost, *(f.cost for f in found)])
+        least = min([goal, before.cost, *(f.cost for f in fits)])
         added = [(effect, values, gain)]
-        own = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
-        found += [own] if own is not None else []
-    if not any(f.cost < before.cost for f in found):
+        item = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
+        fits += [item] if item is not None else []
+    if not any(f.cost < before.cost for f in fits):
         nested, states = [(effect, starts[0][0], 0.0)], tuple(before.starts())
         last = fit_with_all(before, experiments, nested, states, {}, 3 * QUICK, goal)
-        found += [last] if last is not None else []
-    return min(found, key=lambda f: f.cost, default=None)
+        fits += [last] if last is not None else []
+    return min(fits, key=lambda f: f.cost, default=None)
 
 
 def fit_with_all(
@@ -77,11 +77,11 @@ def fit_with_all(
             for effect, values, gain in added:
                 low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
                 moved = effect.linear or effect.gain in effect.fitted
-                own = share * gain if moved else gain
+                item = share * gain if moved else gain
                 if not effect.linear:
-                    own = float(np.clip(own, 0.9 * low, 0.9 * high))
-                model = model.with_effect(effect, {**effect.at_gain(own, values), **reset})
-            found = fit(
+                    item = float(np.clip(item, 0.9 * low, 0.9 * high))
+                model = model.with_effect(effect, {**effect.at_gain(item, values), **reset})
+            result = fit(
                 model,
                 weighted(before, experiments),
                 names,
@@ -92,7 +92,7 @@ def fit_with_all(
                 rtol=rtol,
                 goal=np.inf if held else goal,
             )
-            return continued(found, experiments, rtol, 1e-3, _FREED) if held else found
+            return continued(result, experiments, rtol, 1e-3, _FREED) if held else result
         except PsaError:
             continue
     return None
@@ -181,8 +181,8 @@ def with_causes(
         for d, gain in zip(start.directions, start.gains, strict=True)
     ]
     memory = tuple(
-        {k: v for d in start.directions for k, v in d.memory[r].items()} | own
-        for r, own in enumerate(before.fit.starts())
+        {k: v for d in start.directions for k, v in d.memory[r].items()} | item
+        for r, item in enumerate(before.fit.starts())
     )
     quick = fit_with_all(before.fit, experiments, added, memory, {}, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
@@ -229,11 +229,11 @@ def any_afresh(
     before: Hypothesis, experiments: Sequence[Experiment], scores: Sequence[Score]
 ) -> Hypothesis | None:
     """Fit the effects of the scores afresh; return the best of all."""
-    found = side_by_side(
+    results = side_by_side(
         lambda d: _from_ordinary(before.fit, experiments, d.effect, d.values),
         [score.direction for score in scores],
     )
-    final = _best_continued([f for own in found for f in own], experiments, _CONTINUED_ANY)
+    final = _best_continued([f for item in results for f in item], experiments, _CONTINUED_ANY)
     if final is None:
         return None
     effect = next(e for e in final.model.components if e not in before.fit.model.components)
@@ -244,21 +244,21 @@ def in_place(
     whole: Hypothesis,
     less: Hypothesis,
     reached: Fit,
-    own: Fit,
+    item: Fit,
     effect: Component,
     experiments: Sequence[Experiment],
     goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect beside the causes of `less`, where the `whole` has another one.
 
-    The effect begins with its values in its `own` fit, the rest with those that were `reached`;
+    The effect begins with its values in its `item` fit, the rest with those that were `reached`;
     what `reached` does not have stays as in `less`.
     """
-    values = own.model.values
+    values = item.model.values
     start = (
         {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
         values[effect.gain or ""],
-        tuple({**s, **r} for s, r in zip(own.starts(), reached.starts(), strict=True)),
+        tuple({**s, **r} for s, r in zip(item.starts(), reached.starts(), strict=True)),
     )
     return exchanged(whole, less, effect, start, reached, experiments, goal)
 
@@ -322,10 +322,10 @@ def without(
             start = model.with_values({n: share * model.values[n] for n in gains})
             parts = weighted(whole.fit, experiments)
             sigma = None if is_stack(start) else whole.fit.sigma
-            found = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
+            result = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
         except PsaError:
             continue
-        return hypothesis(causes, found, experiments, final=True)
+        return hypothesis(causes, result, experiments, final=True)
     return None
 
 
@@ -340,20 +340,20 @@ def as_led(
     names = [n for n in whole.fit.unknowns.names if n in model.values]
     start, parts = replace(whole.fit, model=model), weighted(whole.fit, experiments)
     try:
-        found = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
+        result = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
     except PsaError:
         return None
     causes = [c for c in whole.causes if c is not cause]
-    return hypothesis(causes, found, experiments)
+    return hypothesis(causes, result, experiments)
 
 
 def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:
-        found = refit(of.fit, weighted(of.fit, experiments), of.fit.unknowns.names)
+        result = refit(of.fit, weighted(of.fit, experiments), of.fit.unknowns.names)
     except PsaError:
         return None
-    return hypothesis(of.causes, found, experiments, final=True)
+    return hypothesis(of.causes, result, experiments, final=True)
 
 
 def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.inf) -> Hypothesis:
@@ -387,12 +387,12 @@ def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis
     if at_end is None:
         return None
     kept = {at_end.gain, *at_end.linear}
-    own = {n: _declared(at_end, n) for n in at_end.fitted if n not in kept}
+    table = {n: _declared(at_end, n) for n in at_end.fitted if n not in kept}
     gains = at_end.linear or (at_end.gain or "",)
 
     def begin(share: float) -> Fit | None:
         try:
-            model = of.fit.model.with_values({**own, **{n: share * values[n] for n in gains}})
+            model = of.fit.model.with_values({**table, **{n: share * values[n] for n in gains}})
             start = replace(of.fit, model=model)
             rtol = quick_rtol(of.fit.sigma, experiments)
             return continued(start, experiments, rtol, 1e-3, _AFRESH, of.fit.cost)
@@ -401,8 +401,8 @@ def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis
 
     fits = [f for f in side_by_side(begin, _AGAIN) if f is not None and f.cost < of.fit.cost]
     best = min(fits, key=lambda f: f.cost, default=None)
-    found = hypothesis(of.causes, best, experiments)
-    return None if found is None else to_end(found, experiments)
+    result = hypothesis(of.causes, best, experiments)
+    return None if result is None else to_end(result, experiments)
 
 
 def _from_ordinary(

@@ -73,8 +73,8 @@ class Hypothesis:
     @property
     def colour(self) -> Colour:
         """The colour of its own residual, in every channel's fitted samples."""
-        first, *beside = (own.colour for own in self.own)
-        return replace(first, further=tuple(beside))
+        first, *others = (item.colour for item in self.own)
+        return replace(first, further=tuple(others))
 
     def beyond_noise(self, before: "Hypothesis", held: Sequence[int], chance: float) -> float:
         """Return its evidence over another one where either's residual may be noise of its colour.
@@ -116,11 +116,11 @@ class Hypothesis:
         What it takes from a further channel counts over that one's level, as of the first.
         """
         level, count = rms(np.array(before.fit.sigma)), max(len(before.fit.residuals), 1)
-        beside = sum(
+        others = sum(
             len(old.residuals) / count * (old.rms**2 - new.rms**2) * (level / old.level) ** 2
             for old, new in zip(before.fit.further, self.fit.further, strict=True)
         )
-        return before.fit.rms**2 - self.fit.rms**2 + beside
+        return before.fit.rms**2 - self.fit.rms**2 + others
 
     def leaves(self, before: "Hypothesis") -> float:
         """What it leaves of another one's error over whole records, in power, over that [-]."""
@@ -149,35 +149,37 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        shown = tuple(fit.shown(experiments))
+        displayed = tuple(fit.shown(experiments))
     except PsaError:
         return None
     rows, colours = [], []
     for k, f in enumerate(fit.channels):
         held, train, every, rests = [], [], [], []
-        for e, y in zip(experiments, shown, strict=True):
+        for e, y in zip(experiments, displayed, strict=True):
             left = e.errors(f.number, y[:, k])
             held.append(left[e.at(f.number, e.held_out)])
             train.append(left[e.at(f.number)])
             every.append(left[np.isfinite(left)])
             rests.append(left)
-        own = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
-        rows.append((own[0] or (f.rms if k else 0.0), *own[1:]))
+        item = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
+        rows.append((item[0] or (f.rms if k else 0.0), *item[1:]))
         fitted = [e.at(f.number) for e in experiments]
         judged = [e.at(f.number, e.held_out) for e in experiments]
-        rates = [np.gradient(y[:, k]) for y in shown]
+        rates = [np.gradient(y[:, k]) for y in displayed]
         # the parameters of several channels do not follow the colour of one of them
         free = slice(0 if fit.further else None)
         follow = f.jacobian[:, free], fit.unknowns.prior[free]
         colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
-    return Hypothesis(tuple(causes), fit, shown, held_rms, train_rms, whole, tuple(colours), final)
+    return Hypothesis(
+        tuple(causes), fit, displayed, held_rms, train_rms, whole, tuple(colours), final
+    )
 
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     """Return a hypothesis with noise that enters its model, if that is likelier."""
-    own = task.pack.entering(of.fit, task.experiments, of.shown, of.own)
-    return replace(of, own=own)
+    item = task.pack.entering(of.fit, task.experiments, of.shown, of.own)
+    return replace(of, own=item)
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
@@ -280,8 +282,8 @@ class View:
         further start differs from the best one in as many trial values as it can. One that is
         looked for with both signs of its gain begins at each of these steps, too.
         """
-        own = [s for s in self.screening.scores if s.direction.effect.name == name]
-        near = [s for s in own if s.decrease >= 0.3 * own[0].decrease]
+        items = [s for s in self.screening.scores if s.direction.effect.name == name]
+        near = [s for s in items if s.decrease >= 0.3 * items[0].decrease]
         starts: list[Score] = []
 
         def form(score: Score) -> dict[str, float]:
@@ -300,8 +302,8 @@ class View:
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
                 starts.append(score)
-        both = min(own[0].direction.effect.finite_step, default=0.0) < 0.0
-        return starts + [s for s in own if both and s.direction.finite and s not in starts]
+        both = min(items[0].direction.effect.finite_step, default=0.0) < 0.0
+        return starts + [s for s in items if both and s.direction.finite and s not in starts]
 
     @property
     def promise(self) -> float:
@@ -314,9 +316,9 @@ class View:
 
         Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
         """
-        seen = self.decrease >= self.screening.threshold
-        seen = seen and self.pack.shows(self.of.fit, self.promise, self.test)
-        return seen and (self.test.alarm or not self.of.causes)
+        observed = self.decrease >= self.screening.threshold
+        observed = observed and self.pack.shows(self.of.fit, self.promise, self.test)
+        return observed and (self.test.alarm or not self.of.causes)
 
     @property
     def leaves(self) -> bool:
@@ -344,13 +346,13 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    residuals, colour, own = [f.residuals for f in fit.channels], screening.colour, False
+    residuals, colour, item = [f.residuals for f in fit.channels], screening.colour, False
     if not of.causes:  # is there anything but noise of some colour?
-        own, tested = True, [c.tested for c in of.own]
-        residuals, (colour, *beside) = [r for r, _ in tested], [c for _, c in tested]
-        colour = replace(colour, further=tuple(beside))
-    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=own)
-    coloured = own and any(c.autoregression.size for c in of.own)
+        item, tested = True, [c.tested for c in of.own]
+        residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
+        colour = replace(colour, further=tuple(others))
+    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=item)
+    coloured = item and any(c.autoregression.size for c in of.own)
     if coloured and kept and task.pack.asks_effects and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
@@ -370,8 +372,8 @@ def _asked(
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
     share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
     size = float(np.sqrt(min(share, 1.0))) * fit.rms
-    asked = replace(test, p_value=p, seen="effect", size=size)
-    return asked if asked.alarm else test
+    requested = replace(test, p_value=p, seen="effect", size=size)
+    return requested if requested.alarm else test
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
@@ -399,14 +401,14 @@ def held_out_confirms(
     if not any(scale.held):
         return True
     promise = 0.0
-    for k, (f, own) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
+    for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
         rows = zip(experiments, of.shown, before.shown, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )
         if change.size:
             after = max(float(np.hypot(of.held[k], f.straight)), 1e-300)
-            samples = change.size / own.inflation
+            samples = change.size / item.inflation
             promise += 0.5 * samples * float(np.mean(change**2)) / after**2
     gained, score = scale.held_out(of, before), scale.of_fitted(of) - scale.of_fitted(before)
     return confirmed(gained, promise, score, scale.limits)

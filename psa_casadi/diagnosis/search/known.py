@@ -56,8 +56,8 @@ class Known:
         root = root_of(base, task)
         first = examine(root, task)
         self.trials = first.trials
-        own = scale_of(root, first.screening.colour, task.limits, task.experiments)
-        self.scale = replace(own, held=()) if "held out" in task.method.without else own
+        item = scale_of(root, first.screening.colour, task.limits, task.experiments)
+        self.scale = replace(item, held=()) if "held out" in task.method.without else item
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
@@ -91,8 +91,8 @@ class Known:
             names = frozenset(c.name for c in causes)
             known = [self.found.get(names | {c.name}) for c in left]
             gains = [-np.inf if k is None else self.scale.evidence(k) for k in known]
-            own = [c.name not in shared for c in left]
-            causes.append(left.pop(max(range(len(left)), key=lambda k: (own[k], gains[k]))))
+            items = [c.name not in shared for c in left]
+            causes.append(left.pop(max(range(len(left)), key=lambda k: (items[k], gains[k]))))
         self.found[h.names] = ordered = replace(h, causes=tuple(causes))
         return ordered
 
@@ -110,10 +110,10 @@ class Known:
             self.found[found.names] = kept if causes else noisy(kept, self.task)
             self.tell(kept, "finished" if kept.final else "fitted")
 
-    def replaces(self, found: Hypothesis, old: Hypothesis) -> bool:
+    def replaces(self, result: Hypothesis, old: Hypothesis) -> bool:
         """Whether a fit of the same causes takes another one's place."""
-        gained = self.scale.evidence(found) - self.scale.evidence(old)
-        return another_minimum(gained, self.scale.held_out(found, old))
+        gained = self.scale.evidence(result) - self.scale.evidence(old)
+        return another_minimum(gained, self.scale.held_out(result, old))
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
@@ -142,18 +142,18 @@ class Known:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted beside one, best first."""
-        found = [self.found.get(h.names | {n}) for n in self.fitted.get(h.names, ())]
-        own = []
-        for child in found:
+        items = [self.found.get(h.names | {n}) for n in self.fitted.get(h.names, ())]
+        item = []
+        for child in items:
             if child is not None:
                 added = [c for c in child.causes if c.name not in h.names]
-                own.append(replace(child, causes=(*h.causes, *added)))
-        return sorted(own, key=lambda c: -self.scale.evidence(c))
+                item.append(replace(child, causes=(*h.causes, *added)))
+        return sorted(item, key=lambda c: -self.scale.evidence(c))
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
-        own, children = self.scale.evidence(h), self.children(h)
-        gains = [self.scale.evidence(c) - own for c in children]
+        item, children = self.scale.evidence(h), self.children(h)
+        gains = [self.scale.evidence(c) - item for c in children]
         least = nearly(gains[0]) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
@@ -249,11 +249,11 @@ class Known:
         that back.
         """
         if (h, before) not in self.noises:
-            found = self.exceeds(h, before)
-            if found and before.own[0].autoregression.size:
+            result = self.exceeds(h, before)
+            if result and before.own[0].autoregression.size:
                 led = as_led(h, cause, self.task.experiments)
-                found = led is None or self.exceeds(h, led)
-            self.noises[h, before] = found
+                result = led is None or self.exceeds(h, led)
+            self.noises[h, before] = result
         return self.noises[h, before]
 
     def exceeds(self, h: Hypothesis, before: Hypothesis) -> bool:

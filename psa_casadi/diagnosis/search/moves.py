@@ -78,14 +78,14 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
             for name, value in asdict(mode).items()
         }
         added = [(effect, values, 1.0)]
-        found = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
-        if found is None:
+        result = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        if result is None:
             return None
-        ringing = [m for m in _modes(found, len(modes)) if m.damping < MOST_DAMPED]
+        ringing = [m for m in _modes(result, len(modes)) if m.damping < MOST_DAMPED]
         if len(ringing) == len(modes):
-            return hypothesis((*before.causes, effect), found, experiments)
-        base = found.model.without([effect.name])
-        modes, states = ringing, tuple(found.starts())
+            return hypothesis((*before.causes, effect), result, experiments)
+        base = result.model.without([effect.name])
+        modes, states = ringing, tuple(result.starts())
         fit = replace(before.fit, model=base)
     return None
 
@@ -108,10 +108,10 @@ def one_mode(
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    found = side_by_side(
+    results = side_by_side(
         lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
     )
-    best = sorted((h for h in found if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
+    best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
     return side_by_side(lambda h: to_end(h, experiments), best)
 
 
@@ -142,8 +142,8 @@ def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
     steps, _ = accurate(model, t, u, start_on(model, t, u).x, rtol=_RTOL, hold="linear")
     values = model.structure.balance("wafer_force").map(count)
     p = np.tile(model.parameter_vector()[:, None], count)
-    found: FloatArray = values(t[None], steps.x.T, u.T, p).full().ravel()
-    return found / stiffness_scale(model.values)
+    result: FloatArray = values(t[None], steps.x.T, u.T, p).full().ravel()
+    return result / stiffness_scale(model.values)
 
 
 #: So many rivals of a cause are fitted, and so many copies.
@@ -216,16 +216,16 @@ def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[C
     added = np.concatenate([(p - q)[e.at(h.fit.channels[0].number)] for p, q, e in pairs])
     table = [e for e in task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
-    power, found = copies(less.fit, added, trials, known.scale.colour, task.limits)
-    own = known.scale.evidence(h)
+    power, result = copies(less.fit, added, trials, known.scale.colour, task.limits)
+    item = known.scale.evidence(h)
     lost: dict[str, float] = {}
-    for name, copy in found.items():
+    for name, copy in result.items():
         left = 0.5 * power * (1.0 - copy.share)
         fitted = known.found.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
-        if left < NEAR and reached < own - left - NEAR:
+        if left < NEAR and reached < item - left - NEAR:
             lost[name] = left
-    return [found[n] for n in sorted(lost, key=lambda n: lost[n])[:_MOST]]
+    return [result[n] for n in sorted(lost, key=lambda n: lost[n])[:_MOST]]
 
 
 def _effect(starts: Sequence[Score]) -> Component:
@@ -248,31 +248,31 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     with both. These go to their end, since they need more steps for it.
     """
     root, price = known.root, known.scale.limits.price
-    view, alike = known.view(root), task.alike(root.fit)
+    view, similar = known.view(root), task.alike(root.fit)
     if not view.trials:
         return
     every = [
-        found
+        results
         for size in range(2, task.limits.most_causes + 1)
-        for found in best_sets(
-            root.fit, view.trials, view.screening.colour, size, alike, task.limits
+        for results in best_sets(
+            root.fit, view.trials, view.screening.colour, size, similar, task.limits
         )
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
-    beside = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
-    pairs = [s for s in ranked if s.names in beside]
+    items = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
+    pairs = [s for s in ranked if s.names in items]
     apart = [s for s in ranked if not s.names & h.names]
     starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
-    said = ", ".join("+".join(sorted(s.names)) for s in starts)
-    task.progress(f"several causes: fitting {said}")
+    text = ", ".join("+".join(sorted(s.names)) for s in starts)
+    task.progress(f"several causes: fitting {text}")
     goal = cost_beside(known.best().fit, root.fit, task.experiments)
     ways = [with_causes]
     if "fits afresh" not in task.method.without:
         ways.append(with_causes_afresh)
     jobs = [(way, s) for way in ways for s in starts]
-    found = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
-    fitted = [f for f in found if f is not None]
-    better = [f for f in fitted if f.names in beside and known.scale.evidence(f) > 0.0]
+    results = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
+    fitted = [f for f in results if f is not None]
+    better = [f for f in fitted if f.names in items and known.scale.evidence(f) > 0.0]
     tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]

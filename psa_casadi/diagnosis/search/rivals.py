@@ -18,14 +18,14 @@ def fit_rivals(known: Known) -> None:
         less = known.found.get(names)
         if less is None:
             continue
-        view, own = known.view(less), known.scale.evidence(less)
-        top = known.scale.evidence(best) - own
+        view, item = known.view(less), known.scale.evidence(less)
+        top = known.scale.evidence(best) - item
         near = top - known.task.limits.clearly * temperature(top)
         for name, evidence in view.estimated().items():
             if evidence > near and names | {name} not in known.found:
                 known.note(with_cause(less, experiments, view.starts_of(name)))
-        beside = [h for h in known.found.values() if h.names > names and len(h.names - names) == 1]
-        known.remember(less, *(n for h in beside for n in h.names - names))
-        open_ones = [h for h in beside if not h.final]
-        known.finish([h for h in open_ones if known.scale.evidence(h) - own > near])
+        items = [h for h in known.found.values() if h.names > names and len(h.names - names) == 1]
+        known.remember(less, *(n for h in items for n in h.names - names))
+        open_ones = [h for h in items if not h.final]
+        known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
     known.worthy = frozenset(n for n, h in known.found.items() if known.worth(h))

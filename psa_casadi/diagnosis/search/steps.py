@@ -89,14 +89,14 @@ class Step:
         return self.chosen.causes[-1]
 
 
-def steps_of(found: Known, task: Task) -> list[Step]:
+def steps_of(known: Known, task: Task) -> list[Step]:
     """Return the steps to the best hypothesis; the last one is that itself."""
-    ways = [_way(found, task, k) for k in range(len(found.answer.causes))]
-    ways.append(found.answer)
-    views = [_view(found, h, task) for h in ways]
+    ways = [_way(known, task, k) for k in range(len(known.answer.causes))]
+    ways.append(known.answer)
+    views = [_view(known, h, task) for h in ways]
     pairs = zip(views, [*ways[1:], None], strict=True)
-    steps = [_step(found, task, view, chosen) for view, chosen in pairs]
-    return [*steps[:-1], replace(steps[-1], remarks=found.remarks)]
+    steps = [_step(known, task, view, chosen) for view, chosen in pairs]
+    return [*steps[:-1], replace(steps[-1], remarks=known.remarks)]
 
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
@@ -105,52 +105,52 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 
-def _way(found: Known, task: Task, count: int) -> Hypothesis:
+def _way(known: Known, task: Task, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
-    best = found.answer
-    own = found.found.get(best.names_upto(count))
-    if own is not None:
-        return replace(own, causes=best.causes[:count])
+    best = known.answer
+    item = known.found.get(best.names_upto(count))
+    if item is not None:
+        return replace(item, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
         less = without(best, cause, task.experiments)
         best = best if less is None else less
     return best
 
 
-def _view(found: Known, h: Hypothesis, task: Task) -> View:
+def _view(known: Known, h: Hypothesis, task: Task) -> View:
     """Look at a hypothesis; what effects would add is known from where the search began."""
-    own = found.views.get(h.names)
-    if own is None or own.of.fit is not h.fit:
-        found.views[h.names] = own = examine(h, task, found.trials)
-    return own if own.of is h else replace(own, of=h)
+    view = known.views.get(h.names)
+    if view is None or view.of.fit is not h.fit:
+        known.views[h.names] = view = examine(h, task, known.trials)
+    return view if view.of is h else replace(view, of=h)
 
 
-def _step(found: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
-    fitted = _fitted(found, view.of)
+def _step(result: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
+    fitted = _fitted(result, view.of)
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
-    gain, own = found.scale.gain, found.scale.evidence(view.of)
+    gain, item = result.scale.gain, result.scale.evidence(view.of)
     alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
     if chosen is None:
-        refused = {n for n, c in fitted.items() if c.names not in found.worthy}
-        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, own, task)
+        refused = {n for n, c in fitted.items() if c.names not in result.worthy}
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, item, task)
     cause = chosen.causes[-1]
-    known = found.found.get(found.answer.names - {cause.name})
-    less = known or without(found.answer, cause, task.experiments)
+    known = result.found.get(result.answer.names - {cause.name})
+    less = known or without(result.answer, cause, task.experiments)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), own, task)
-    there = _view(found, less, task)
-    beside = {**_fitted(found, less), cause.name: found.answer}
-    evidence = {**there.estimated(), **{n: gain(c, less) for n, c in beside.items()}}
-    whole = found.scale.evidence(found.answer)
-    refused = {n for n, c in beside.items() if c.names not in found.worthy} - {cause.name}
-    step = Step(view, fitted, chosen, less, there, beside, alone)
-    return _judged(step, evidence, beside, refused, whole, task)
+        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), item, task)
+    there = _view(result, less, task)
+    table = {**_fitted(result, less), cause.name: result.answer}
+    evidence = {**there.estimated(), **{n: gain(c, less) for n, c in table.items()}}
+    whole = result.scale.evidence(result.answer)
+    refused = {n for n, c in table.items() if c.names not in result.worthy} - {cause.name}
+    step = Step(view, fitted, chosen, less, there, table, alone)
+    return _judged(step, evidence, table, refused, whole, task)
 
 
-def _fitted(found: Known, h: Hypothesis) -> dict[str, Hypothesis]:
+def _fitted(known: Known, h: Hypothesis) -> dict[str, Hypothesis]:
     """Return the hypotheses with one more effect, by its name."""
-    every = {n: found.found.get(h.names | {n}) for n in found.fitted.get(h.names, ())}
+    every = {n: known.found.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
     return {n: child for n, child in every.items() if child is not None}
 
 
@@ -168,15 +168,15 @@ def _judged(
 
     Effects that bend the same curve are refused together, and share what the best of them has.
     """
-    alike, good, pack = task.alike(step.fit), set(fitted) - refused, task.pack
-    for group in alike:
+    similar, good, pack = task.alike(step.fit), set(fitted) - refused, task.pack
+    for group in similar:
         if good & set(group):
             every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
             like = {n for n, h, c in every if pack.in_character(h.fit, c, task.experiments)}
             refused = refused - (set(group) & like)
         elif refused & set(group):
             refused = refused | set(group)
-    shared = levelled(evidence, alike, good)
+    shared = levelled(evidence, similar, good)
     chances = probabilities(
         {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
     )
@@ -192,31 +192,31 @@ def contenders(
     effect whose fit fails is left out.
     """
     names = names or credible_set(step.probability, limits.credible)
-    found = dict(step.fitted)
+    result = dict(step.fitted)
     scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0), experiments)
     known = dict(step.evidence)
     for name in names:
-        scores = [] if name in found else step.view.starts_of(name)
+        scores = [] if name in result else step.view.starts_of(name)
         fitted = with_cause(step.view.of, experiments, scores) if scores else None
         if fitted is not None:
-            found[name] = to_end(fitted, experiments)
-            known[name] = scale.gain(found[name], step.view.of)
-    return tuple(Contender(n, found[n].fit, known[n]) for n in names if n in found)
+            result[name] = to_end(fitted, experiments)
+            known[name] = scale.gain(result[name], step.view.of)
+    return tuple(Contender(n, result[n].fit, known[n]) for n in names if n in result)
 
 
 def one_of_each(
-    found: Sequence[Contender], experiments: Sequence[Experiment]
+    result: Sequence[Contender], experiments: Sequence[Experiment]
 ) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
     """Return contenders of which a voltage may tell one from another, and what none will tell.
 
     Of effects that bend the same curve the best fit stands for all.
     """
-    best = sorted(found, key=lambda c: c.fit.cost)
-    own = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
-    groups = same_curves(experiments, own, best[0].fit) if best else ()
+    best = sorted(result, key=lambda c: c.fit.cost)
+    items = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(experiments, items, best[0].fit) if best else ()
     rest = {name for group in groups for name in group[1:]}
     same = tuple(note("same_curve", effects=group) for group in groups)
-    return tuple(c for c in found if c.effect not in rest), same
+    return tuple(c for c in result if c.effect not in rest), same
 
 
 def fit_contenders(
@@ -245,9 +245,9 @@ def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
     plain = hypothesis((), base, task.experiments, final=True)
     if plain is None:
         raise InputError(["The fitted base cannot be simulated over the whole of these records."])
-    seen = examine(plain, task)
+    view = examine(plain, task)
     task.progress("fitting the rivals")
-    step = Step(seen, evidence=seen.estimated())
+    step = Step(view, evidence=view.estimated())
     names = [e.name for e in task.table]
     chosen = contenders(step, task.experiments, task.limits, names)
     lost = {*names} - {c.effect for c in chosen}

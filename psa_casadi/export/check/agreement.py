@@ -123,7 +123,7 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
         name: held(column.tolist()) if inputs.held else from_samples(inputs.times, column)
         for name, column in zip(inputs.names, inputs.values.T, strict=True)
     }
-    found = simulate(
+    result = simulate(
         model.values,
         signals["voltage"],
         times,
@@ -134,7 +134,7 @@ def expected_outputs(model: Model, times: FloatArray, inputs: Signals) -> FloatA
         rtol=_TOLERANCE,
     )
     names = ("displacement" if n == "measured_displacement" else n for n in model.output_names)
-    return np.array([getattr(found, name) for name in names]).T
+    return np.array([getattr(result, name) for name in names]).T
 
 
 def simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
@@ -148,8 +148,8 @@ def simulated(model: Model, times: FloatArray, inputs: Signals) -> FloatArray:
         return (steps.x if quiet else steps.y)[np.isin(grid, times)]
     p = np.array([[model.values[n]] * len(grid) for n in model.parameter_names])
     before = inputs.at(grid, before=True)
-    found = np.array(model.structure.f(grid[None, :], steps.x.T, before.T, p)[1])
-    return found.T[np.isin(grid, times)]
+    result = np.array(model.structure.f(grid[None, :], steps.x.T, before.T, p)[1])
+    return result.T[np.isin(grid, times)]
 
 
 def truth_of(model: Model, version: int) -> Truth:
@@ -256,8 +256,8 @@ def stated_step(directory: Path) -> StatedStep | None:
     if step is None:
         return None
     try:
-        found = read_json(directory / FIXED_ENTRY, "export the FMU again.", FIXED_ENTRY)["errors"]
-        errors = {name: float(found[name]) for name in VOLTAGES}
+        result = read_json(directory / FIXED_ENTRY, "export the FMU again.", FIXED_ENTRY)["errors"]
+        errors = {name: float(result[name]) for name in VOLTAGES}
     except (KeyError, OSError, TypeError, ValueError) as error:
         raise InputError(
             f"{FIXED_ENTRY}: does not state the error for each reference voltage ({error});"

@@ -67,17 +67,17 @@ def rows_apart(task: Task, end: float) -> list[CheckRow]:
                 code, problem = 0, f"the FMU {OVERTIME.format(task.timeout)}"
             finally:
                 kill_group(child)
-            found = _Found(task.key, rows.read())
+            result = _Found(task.key, rows.read())
             printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LAST))
             complained += printed.read()
-    problem = problem or found.problem or _ended(code, found, task.memory)
+    problem = problem or result.problem or _ended(code, result, task.memory)
     if not problem:
-        return found.rows
-    if said := complained.decode(errors="replace").strip()[-_LAST:]:
-        problem += f"; the last it printed: {said}"
-    if not found.rows and not found.begun:  # nothing of the FMU has run
+        return result.rows
+    if statement := complained.decode(errors="replace").strip()[-_LAST:]:
+        problem += f"; the last it printed: {statement}"
+    if not result.rows and not result.begun:  # nothing of the FMU has run
         raise PsaError(f"The process for the code of the FMU did not start: {problem}.")
-    return [*found.rows, stopped(found.begun or OUTSIDE, problem)]
+    return [*result.rows, stopped(result.begun or OUTSIDE, problem)]
 
 
 class _Found:
@@ -102,20 +102,20 @@ class _Found:
             self.complete = kind == "end"
 
 
-def _ended(code: int, found: _Found, memory: int) -> str:
+def _ended(code: int, result: _Found, memory: int) -> str:
     """Return what was wrong with a process that ended by itself, "" if nothing was."""
-    if code == 0 and found.complete:
+    if code == 0 and result.complete:
         return ""
-    if found.full:
+    if result.full:
         return f"the FMU reached the memory limit of {memory / 2**20:.0f} MiB (--memory sets it)"
     if code == _CLOSED:
         return f"{_DISTURBED}it was closed"
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         return f"the FMU ended its process by the signal {name}"
-    shown = f"{code:#x}" if code > 255 else str(code)  # Windows tells faults by such codes
-    when = "when it was unloaded" if found.complete else "before the checks were done"
-    return f"the FMU ended its process with exit code {shown} {when}"
+    text = f"{code:#x}" if code > 255 else str(code)  # Windows tells faults by such codes
+    when = "when it was unloaded" if result.complete else "before the checks were done"
+    return f"the FMU ended its process with exit code {text} {when}"
 
 
 def main() -> None:

@@ -73,20 +73,20 @@ def read_binary(path: Path) -> Binary:
     import lief  # noqa: PLC0415 - an extra
 
     lief.logging.disable()
-    found: Any = lief.parse(str(path))
-    if isinstance(found, lief.ELF.Binary):
-        required = found.symbols_version_requirement
+    result: Any = lief.parse(str(path))
+    if isinstance(result, lief.ELF.Binary):
+        required = result.symbols_version_requirement
         needs = {str(v.name) for r in required for v in r.get_auxiliary_symbols()}
-        exports = {str(s.name) for s in found.exported_symbols}
-        machine, system = found.header.machine_type.name, "linux"
-    elif isinstance(found, lief.PE.Binary):
-        needs, table = set(), found.get_export()
+        exports = {str(s.name) for s in result.exported_symbols}
+        machine, system = result.header.machine_type.name, "linux"
+    elif isinstance(result, lief.PE.Binary):
+        needs, table = set(), result.get_export()
         exports = {str(e.name) for e in table.entries} if table else set()
-        machine, system = found.header.machine.name, "windows"
-    elif isinstance(found, lief.MachO.Binary):
-        names = {str(s.name) for s in found.exported_symbols} - _LINKER
+        machine, system = result.header.machine.name, "windows"
+    elif isinstance(result, lief.MachO.Binary):
+        names = {str(s.name) for s in result.exported_symbols} - _LINKER
         needs, exports = set(), {n.removeprefix("_") for n in names}
-        machine, system = found.header.cpu_type.name, "darwin"
+        machine, system = result.header.cpu_type.name, "darwin"
     else:
         raise InputError(f"{path.name}: is no binary of a known format; export the FMU again.")
     known = f"{_MACHINES.get(machine, 'unknown')}-{system}"

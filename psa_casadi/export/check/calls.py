@@ -91,13 +91,13 @@ def independent_instances(fmu: Fmu) -> Problems:
     """Two instances stepped in turn give what each gives alone."""
     size, shares = fmu.step_size, ((0.2, 0.9, 0.4), (1.0, 0.1, 0.6))
     alone = []
-    for own in shares:
+    for item in shares:
         with fmu.start(CO_SIMULATION) as slave:
-            alone.append(_run(slave, size, own))
+            alone.append(_run(slave, size, item))
     with fmu.start(CO_SIMULATION) as first, fmu.start(CO_SIMULATION) as second:
         for k in range(3):
-            for slave, own, expected in zip((first, second), shares, alone, strict=True):
-                row = _run(slave, size, own[k : k + 1], k * size)
+            for slave, item, expected in zip((first, second), shares, alone, strict=True):
+                row = _run(slave, size, item[k : k + 1], k * size)
                 if _differ(row[0], expected[k]):
                     yield f"two instances disturb each other in step {k + 1}"
 

@@ -216,9 +216,9 @@ def as_exported(archive: Archive, model: Model) -> Model:
         {v.name for c in model.components if c.in_plant is plant for v in _variables(c)}
         for plant in (True, False)
     )
-    own = apart - inside  # what only sensor and environment have
+    item = apart - inside  # what only sensor and environment have
     described = {v.name for v in archive.description.modelVariables}
-    exported = model.plant() if own and own.isdisjoint(described) else model
+    exported = model.plant() if item and item.isdisjoint(described) else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
     return description.published_as(archive, exported)

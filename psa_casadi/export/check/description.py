@@ -123,10 +123,10 @@ def published_as(archive: Archive, model: Model) -> Model:
 
     They are given at the export, and say nothing of what the model computes.
     """
-    said = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
+    table = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
     unstated = publication.terms_of_code()
-    own = {name: text for name, text in said.items() if text != unstated.get(name)}
-    return replace(model, publication=Publication(**own))
+    item = {name: text for name, text in table.items() if text != unstated.get(name)}
+    return replace(model, publication=Publication(**item))
 
 
 #: The checks by the names of their rows.
@@ -157,14 +157,14 @@ def wrong_dependencies(archive: Archive, model: Model) -> Iterator[str]:
     """The dependencies are the sparsity of the model's Jacobian: none missing, none superfluous."""
     names = {(v.kind, v.index): v.name for v in variable_table(model)}
 
-    def named(found: dict[Key, dict[Key, str]]) -> dict[str, dict[str, str]]:
+    def named(table: dict[Key, dict[Key, str]]) -> dict[str, dict[str, str]]:
         return {
             names[unknown]: {names[k]: kind for k, kind in known.items()}
-            for unknown, known in found.items()
+            for unknown, known in table.items()
         }
 
-    found = dependencies(model.structure)
-    truth = named({unknown: without_sampled(known) for unknown, known in found.items()})
+    table = dependencies(model.structure)
+    truth = named({unknown: without_sampled(known) for unknown, known in table.items()})
     initial = named(at_the_start(model))
     if sources.fixed_step_of(archive.directory) is not None:  # there parameters are constants
         for claims in (*truth.values(), *initial.values()):
@@ -206,7 +206,7 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     if tool != generation_tool():
         yield f"it was exported by {tool}, this is {generation_tool()}; export it again to compare"
         return
-    found = {
+    table = {
         p.relative_to(archive.directory).as_posix(): p.read_bytes()
         for p in archive.directory.rglob("*")
         if p.is_file()
@@ -214,7 +214,7 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     untouched = {}
     if _other_casadi(archive) or _read_from_text(model):
         places = {name: f"sources/{name}" for name in sources.FROM_CASADI}
-        untouched = {n: found[p].decode("utf-8") for n, p in places.items() if p in found}
+        untouched = {n: table[p].decode("utf-8") for n, p in places.items() if p in table}
     step = sources.fixed_step_of(archive.directory)
     fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
     token, texts, xml = sources.exported_texts(
@@ -227,11 +227,11 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     if fixed:
         expected[sources.FIXED_ENTRY] = sources.fixed_entry(fixed).decode("utf-8")
     for name, text in sorted(expected.items()):
-        if name not in found:
+        if name not in table:
             yield f"{name} is missing"
-        elif found[name] != text.encode("utf-8"):
+        elif table[name] != text.encode("utf-8"):
             yield f"{name} differs"
-    for name in sorted({n for n in found if n.startswith("sources/")} - set(expected)):
+    for name in sorted({n for n in table if n.startswith("sources/")} - set(expected)):
         yield f"{name} is not among the sources of the model"
 
 
@@ -258,7 +258,7 @@ def _other_casadi(archive: Archive) -> str:
     """Return the version of CasADi that an FMU was made with; empty if it is the one in use."""
     source = archive.directory / "sources" / "model.c"
     try:
-        said = _CASADI.search(source.read_text(encoding="utf-8"))
+        statement = _CASADI.search(source.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError):
         return ""
-    return said[1] if said and said[1] != ca.CasadiMeta.version() else ""
+    return statement[1] if statement and statement[1] != ca.CasadiMeta.version() else ""

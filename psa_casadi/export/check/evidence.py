@@ -39,8 +39,8 @@ def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
             for n in (carried.OUTPUTS, carried.VALIDATION)
             if not (folder / n).is_file()
         )
-    found = {p.relative_to(folder).as_posix() for p in (folder / carried.SETS).glob("*")}
-    yield from (f"{name} is not among the model's" for name in sorted(found - set(expected)))
+    result = {p.relative_to(folder).as_posix() for p in (folder / carried.SETS).glob("*")}
+    yield from (f"{name} is not among the model's" for name in sorted(result - set(expected)))
 
 
 def repeated(
@@ -50,7 +50,7 @@ def repeated(
     evidence = model.evidence if model else None
     if model is None or evidence is None:
         return (Check("evidence", lambda: (_NONE,)).row(),)
-    found: list[CheckRow | Playback] = []
+    result: list[CheckRow | Playback] = []
     if records:
         known = {r.sha256 for r in evidence.runs}
         of = ", ".join(f"{r.record} ({r.sha256[:12]}...)" for r in evidence.runs)
@@ -59,7 +59,7 @@ def repeated(
             for r in records
             if r.sha256 not in known
         ]
-        found.append(Check("records as stated", lambda: strange).row())
+        result.append(Check("records as stated", lambda: strange).row())
     try:
         if evidence.reference is not None:
             times, values = carried.run_inputs(model)
@@ -71,13 +71,13 @@ def repeated(
             inputs = Signals(model.input_names, times, values)
             expected = table[:, names.index("displacement")]
             start = carried.run_start(model)
-            found.append(Playback("reference run", times, inputs, start, "displacement", expected))
+            result.append(Playback("reference run", times, inputs, start, "displacement", expected))
     except BREAKDOWNS as error:
-        found.append(stopped("reference run", f"the check stopped: {error}"))
+        result.append(stopped("reference run", f"the check stopped: {error}"))
     for record in records:
         runs = (r for r in evidence.runs if r.sha256 == record.sha256)
-        found += [_of_record(archive, model, record, run) for run in runs]
-    return tuple(found)
+        result += [_of_record(archive, model, record, run) for run in runs]
+    return tuple(result)
 
 
 def _of_record(
@@ -94,7 +94,7 @@ def _of_record(
     ready = prepared(record)[0] if run.averaged > 1 else as_read(record)
     if ready.n != run.samples:
         return stopped(name, f"the record has {ready.n} samples, {run.samples} are stated")
-    shown = "measured_displacement"
+    text = "measured_displacement"
     times = ready.time - ready.time[0]
     columns = {n: getattr(ready, n, None) for n in archive.names("input")}
     inputs = {n: c for n, c in columns.items() if c is not None}
@@ -106,7 +106,7 @@ def _of_record(
         times,
         Signals(tuple(inputs), times, np.array(list(inputs.values())).T),
         {n: v for n, v in run.start.items() if n in model.state_names},
-        shown if shown in archive.names("output") else "displacement",
+        text if text in archive.names("output") else "displacement",
         np.where(judged, measured(ready) - run.offset_m, np.nan),
         run.held_out_m if run.held_out else run.fitted_m,
     )

@@ -85,15 +85,15 @@ def described(archive: Archive, invalid: Callable[[Archive], Iterator[str]]) -> 
         return _Found(failures=list(invalid(archive))).row("description valid", version)
 
     def units() -> CheckRow:
-        found, said = _Found(), archive.description
-        known = {u.name for u in said.unitDefinitions}
-        given = {v.name: v.unit for v in said.modelVariables if v.unit}
-        wrong = sorted({u for u in given.values() if u not in known})
-        found.failures += [f"the unit '{u}' is not defined" for u in wrong]
-        without = [n for n, e in archive.elements.items() if e.real and e.variable not in given]
+        result, statement = _Found(), archive.description
+        known = {u.name for u in statement.unitDefinitions}
+        table = {v.name: v.unit for v in statement.modelVariables if v.unit}
+        wrong = sorted({u for u in table.values() if u not in known})
+        result.failures += [f"the unit '{u}' is not defined" for u in wrong]
+        without = [n for n, e in archive.elements.items() if e.real and e.variable not in table]
         if without:
-            found.notes.append(f"{len(without)} of {len(archive.elements)} numbers have no unit")
-        return found.row("units defined", version)
+            result.notes.append(f"{len(without)} of {len(archive.elements)} numbers have no unit")
+        return result.row("units defined", version)
 
     yield Check("description valid", valid)
     yield Check("units defined", units)
@@ -104,7 +104,7 @@ def foreign_checks(fmu_of: Callable[[], Fmu], archive: Archive) -> Iterator[Chec
     version, loaded = archive.version, list[Fmu]()
 
     def load() -> CheckRow:
-        found = _Found()
+        result = _Found()
         try:
             fmu = fmu_of()
             for interface in fmu.interfaces():
@@ -112,8 +112,8 @@ def foreign_checks(fmu_of: Callable[[], Fmu], archive: Archive) -> Iterator[Chec
             loaded.append(fmu)
         except BREAKDOWNS as error:
             folders = {p.parent.name for p in archive.binaries()}
-            found.failures.append(f"{error} (it has {', '.join(sorted(folders)) or 'none'})")
-        return found.row("binary loads", version)
+            result.failures.append(f"{error} (it has {', '.join(sorted(folders)) or 'none'})")
+        return result.row("binary loads", version)
 
     yield Check("binary loads", load)
     for fmu in loaded:
@@ -122,33 +122,33 @@ def foreign_checks(fmu_of: Callable[[], Fmu], archive: Archive) -> Iterator[Chec
 
 
 def _looked(fmu: Fmu, name: str, look: _Look) -> CheckRow:
-    found = _Found()
+    result = _Found()
     try:
-        look(fmu, found)
+        look(fmu, result)
     except BREAKDOWNS as error:
-        found.failures.append(str(error))
-    return found.row(name, fmu.version)
+        result.failures.append(str(error))
+    return result.row(name, fmu.version)
 
 
 def _step(fmu: Fmu) -> float:
     """Return a step that the FMU takes: of its default experiment, a multiple of its own."""
-    said, co = fmu.description.defaultExperiment, fmu.description.coSimulation
-    own = float(getattr(co, "fixedInternalStepSize", None) or 0.0)
-    start, stop = (float(getattr(said, n, None) or 0.0) for n in ("startTime", "stopTime"))
-    told = float(getattr(said, "stepSize", None) or 0.0) or (stop - start) / 100 or 0.01
-    return max(1, min(_MOST_OWN, round(told / own))) * own if own else told
+    statement, co = fmu.description.defaultExperiment, fmu.description.coSimulation
+    item = float(getattr(co, "fixedInternalStepSize", None) or 0.0)
+    start, stop = (float(getattr(statement, n, None) or 0.0) for n in ("startTime", "stopTime"))
+    output = float(getattr(statement, "stepSize", None) or 0.0) or (stop - start) / 100 or 0.01
+    return max(1, min(_MOST_OWN, round(output / item))) * item if item else output
 
 
 def _inputs(fmu: Fmu, share: float) -> dict[str, float]:
     """Return inputs at their starts, those that are real moved by a share of their nominals."""
-    found = {}
+    table = {}
     for name, e in fmu.elements.items():
         v = fmu.variables[e.variable]
         if v.causality == "input":
             low, high = fmu.bounds[e.variable]
             moved = e.starts[e.place] + share * fmu.nominals[e.variable] * e.real
-            found[name] = float(np.clip(moved, low, high))
-    return found
+            table[name] = float(np.clip(moved, low, high))
+    return table
 
 
 def _states(fmu: Fmu) -> list[str]:
@@ -228,16 +228,16 @@ def _continue(instance: Instance) -> None:
         instance.leave_event_mode()
 
 
-def _instances(fmu: Fmu, found: _Found) -> None:
+def _instances(fmu: Fmu, result: _Found) -> None:
     """Every interface that the description announces gives an instance."""
     for interface in fmu.interfaces():
         try:
             fmu.open(interface).free()
         except FmuError as error:
-            found.failures.append(f"{_WORDS[interface]}: {error}")
+            result.failures.append(f"{_WORDS[interface]}: {error}")
 
 
-def _life_cycle(fmu: Fmu, found: _Found) -> None:
+def _life_cycle(fmu: Fmu, result: _Found) -> None:
     """Initialise, run, terminate, reset, and the same again."""
     for interface in fmu.interfaces():
         with _begun(fmu, interface) as instance:
@@ -247,7 +247,7 @@ def _life_cycle(fmu: Fmu, found: _Found) -> None:
             instance.setup()
             _continue(instance)
             if off := _off(first, _run(instance)):
-                found.failures.append(
+                result.failures.append(
                     f"{_WORDS[interface]}: after a reset it gives other results ({off:.2g} off)"
                 )
 
@@ -261,7 +261,7 @@ def _off(a: FloatArray, b: FloatArray) -> float:
     return max(off, 1e-16)
 
 
-def _same_bits(fmu: Fmu, found: _Found) -> None:
+def _same_bits(fmu: Fmu, result: _Found) -> None:
     """A second instance gives the same bits."""
     for interface in fmu.interfaces():
         runs = []
@@ -269,35 +269,37 @@ def _same_bits(fmu: Fmu, found: _Found) -> None:
             with _begun(fmu, interface) as instance:
                 runs.append(_run(instance))
         if off := _off(*runs):
-            found.notes.append(f"{_WORDS[interface]}: a second instance is {off:.2g} off the first")
+            result.notes.append(
+                f"{_WORDS[interface]}: a second instance is {off:.2g} off the first"
+            )
 
 
-def _several(fmu: Fmu, found: _Found) -> None:
+def _several(fmu: Fmu, result: _Found) -> None:
     """Two instances in turn give what each gives alone, where several are allowed."""
     for interface in fmu.interfaces():
         kind = (fmu.description.modelExchange, fmu.description.coSimulation)[interface]
         if kind.canBeInstantiatedOnlyOncePerProcess:
-            found.notes.append(f"{_WORDS[interface]}: one instance for each process")
+            result.notes.append(f"{_WORDS[interface]}: one instance for each process")
         elif interface == CO_SIMULATION:
             size, (a, b) = _step(fmu), (_SHARES, _SHARES[::-1])
             alone = []
-            for own in (a, b):
+            for item in (a, b):
                 with _begun(fmu, interface) as instance:
-                    alone.append(_stepped(instance, size, own))
+                    alone.append(_stepped(instance, size, item))
             with _begun(fmu, interface) as first, _begun(fmu, interface) as second:
                 for k in range(len(a)):
-                    for instance, own, expected in ((first, a, alone[0]), (second, b, alone[1])):
-                        instance.set(_inputs(fmu, own[k]))
+                    for instance, item, expected in ((first, a, alone[0]), (second, b, alone[1])):
+                        instance.set(_inputs(fmu, item[k]))
                         instance.step(k * size, size)
                         off = _off(expected[k], instance.get(_shown(fmu)))
                         if off > _ROUNDING:
-                            found.failures.append(
+                            result.failures.append(
                                 f"two instances disturb each other in step {k + 1}"
                             )
                             return
 
 
-def _memory(fmu: Fmu, found: _Found) -> None:
+def _memory(fmu: Fmu, result: _Found) -> None:
     """An instance that is freed leaves nothing behind."""
     interface, end = fmu.interfaces()[0], time.monotonic() + _PATIENCE
     before, count = 0, 0
@@ -310,11 +312,11 @@ def _memory(fmu: Fmu, found: _Found) -> None:
             break
     left = max(0.0, float(_resident() - before)) / max(1, count - _WARM)
     if not before:
-        found.notes.append("this system does not tell the memory of a process")
+        result.notes.append("this system does not tell the memory of a process")
         return
-    found.figure, found.limit = left, _LEFT
+    result.figure, result.limit = left, _LEFT
     text = f"{left:.0f} bytes left by each of {count} cycles"
-    (found.failures if left > _LEFT else found.notes if count < _CYCLES else []).append(text)
+    (result.failures if left > _LEFT else result.notes if count < _CYCLES else []).append(text)
 
 
 def _resident() -> int:
@@ -323,12 +325,12 @@ def _resident() -> int:
     return memory_of_process("RssAnon")
 
 
-def _state(fmu: Fmu, found: _Found) -> None:
+def _state(fmu: Fmu, result: _Found) -> None:
     """A state that is saved and restored replays the same, also by way of bytes."""
     for interface in fmu.interfaces():
         kind = (fmu.description.modelExchange, fmu.description.coSimulation)[interface]
         if not kind.canGetAndSetFMUstate:  # fmpy's name in FMI 3.0, too
-            found.notes.append(f"{_WORDS[interface]}: it announces no way to save its state")
+            result.notes.append(f"{_WORDS[interface]}: it announces no way to save its state")
             continue
         with _begun(fmu, interface) as instance:
             ways = [instance.save()]
@@ -340,23 +342,23 @@ def _state(fmu: Fmu, found: _Found) -> None:
             for way, words in zip(ways, ("restored", "read back from bytes"), strict=False):
                 instance.restore(way)
                 if off := _off(first, _run(instance)):
-                    found.failures.append(
+                    result.failures.append(
                         f"{_WORDS[interface]}: a state that is {words} replays {off:.2g} off"
                     )
             for way in ways:
                 instance.drop(way)
 
 
-def _derivatives(fmu: Fmu, found: _Found) -> None:
+def _derivatives(fmu: Fmu, result: _Found) -> None:
     """Directional derivatives of model exchange are those of differences, at two step sizes."""
     exchange = fmu.description.modelExchange
     if exchange is None or not exchange.providesDirectionalDerivative:
-        found.notes.append("it provides none")
+        result.notes.append("it provides none")
         return
     states = _states(fmu)
     unknowns = [n for n in _told(fmu) if n not in states]
     if any(fmu.elements[n].count > 1 for n in [*unknowns, *states]):
-        found.notes.append("not looked at: arrays")
+        result.notes.append("not looked at: arrays")
         return
     with _begun(fmu, MODEL_EXCHANGE) as instance:
         x, inputs = instance.vector("GetContinuousStates", len(states)), _continuous(fmu, 0.1)
@@ -374,28 +376,30 @@ def _derivatives(fmu: Fmu, found: _Found) -> None:
         off = []
         for h in (_DIFFERENCE, 10 * _DIFFERENCE):
             slopes, here = (at(h) - at(-h)) / (2 * h), at(0.0)
-            said = instance.directional(unknowns, knowns, seed)
-            off.append(np.abs(slopes - said) / (np.abs(said) + np.abs(here) + 1e-300))
+            values = instance.directional(unknowns, knowns, seed)
+            off.append(np.abs(slopes - values) / (np.abs(values) + np.abs(here) + 1e-300))
     worst = np.minimum(*off)
-    found.figure, found.limit = float(np.max(worst, initial=0.0)), _SLOPE
+    result.figure, result.limit = float(np.max(worst, initial=0.0)), _SLOPE
     for name, one in zip(unknowns, worst, strict=True):
         if one > _SLOPE:
-            found.failures.append(f"that of '{name}' is {one:.2g} off a difference")
+            result.failures.append(f"that of '{name}' is {one:.2g} off a difference")
 
 
 def _settable(fmu: Fmu) -> dict[str, float]:
     """Return the start values of parameters, inputs and variables that start exactly there."""
-    found = {}
+    table = {}
     for name, e in fmu.elements.items():
         v = fmu.variables[e.variable]
-        said = v.start is not None and v.causality != "independent" and v.variability != "constant"
+        statement = (
+            v.start is not None and v.causality != "independent" and v.variability != "constant"
+        )
         exact = v.initial == "exact" or v.causality in ("parameter", "input")
-        if said and exact and v.causality != "structuralParameter":
-            found[name] = e.starts[e.place]
-    return found
+        if statement and exact and v.causality != "structuralParameter":
+            table[name] = e.starts[e.place]
+    return table
 
 
-def _start_values(fmu: Fmu, found: _Found) -> None:
+def _start_values(fmu: Fmu, result: _Found) -> None:
     """What is read after initialization is what the description says, where nothing was set."""
     starts = _settable(fmu)
     if not starts:
@@ -403,14 +407,14 @@ def _start_values(fmu: Fmu, found: _Found) -> None:
     with fmu.open(fmu.interfaces()[0]) as instance:
         instance.setup()
         read = instance.get(list(starts))
-    for (name, said), value in zip(starts.items(), read, strict=True):
-        if abs(value - said) > 1e-6 * max(abs(said), abs(value)):
-            found.failures.append(
-                f"'{name}' starts at {value:.6g}, its description says {said:.6g}"
+    for (name, statement), value in zip(starts.items(), read, strict=True):
+        if abs(value - statement) > 1e-6 * max(abs(statement), abs(value)):
+            result.failures.append(
+                f"'{name}' starts at {value:.6g}, its description says {statement:.6g}"
             )
 
 
-def _taken(fmu: Fmu, found: _Found) -> None:
+def _taken(fmu: Fmu, result: _Found) -> None:
     """A start value that is set before initialization is the value after it."""
     moved = {}
     for name, start in _settable(fmu).items():
@@ -420,31 +424,31 @@ def _taken(fmu: Fmu, found: _Found) -> None:
         if e.real and fmu.variables[e.variable].variability != "fixed" and low <= new <= high:
             moved[name] = new
     if not moved:
-        found.notes.append("nothing can be set")
+        result.notes.append("nothing can be set")
         return
     with fmu.open(fmu.interfaces()[0]) as instance:
         instance.setup(values=moved)
         read = instance.get(list(moved))
     for (name, new), value in zip(moved.items(), read, strict=True):
         if abs(value - new) > 1e-6 * max(abs(new), abs(value)):
-            found.failures.append(f"'{name}' was set to {new:.6g} and is {value:.6g}")
+            result.failures.append(f"'{name}' was set to {new:.6g} and is {value:.6g}")
 
 
-def _dependencies(fmu: Fmu, found: _Found) -> None:
+def _dependencies(fmu: Fmu, result: _Found) -> None:
     """What moves an output or a rate is among the dependencies that are told of it."""
     states, real = _states(fmu), set(_told(fmu))
-    told = {
+    table = {
         str(e.variable.name): {str(d.name) for d in e.dependencies}
         for e in (*fmu.description.outputs, *fmu.description.derivatives)
         if e.dependencies is not None and e.variable.name in real - {*states}
     }
-    if fmu.description.modelExchange is None or not told:
-        found.notes.append("none are told, or there is no model exchange to see them by")
+    if fmu.description.modelExchange is None or not table:
+        result.notes.append("none are told, or there is no model exchange to see them by")
         return
     with _begun(fmu, MODEL_EXCHANGE) as instance:
         x, inputs = instance.vector("GetContinuousStates", len(states)), _continuous(fmu, 0.1)
         x = x + 0.1 * _nominals(fmu, states)
-        names = list(told)
+        names = list(table)
 
         def at(states_now: FloatArray, inputs_now: dict[str, float]) -> FloatArray:
             instance.derivatives(0.0, states_now, inputs_now)
@@ -460,15 +464,15 @@ def _dependencies(fmu: Fmu, found: _Found) -> None:
     for known, there in moves:
         for name, moved in zip(names, np.abs(there - here) > _ROUNDING * np.abs(here), strict=True):
             variable = fmu.elements[known].variable
-            if moved and known not in told[name] and variable not in told[name]:
-                found.failures.append(f"'{name}' depends on '{known}', which is not told")
+            if moved and known not in table[name] and variable not in table[name]:
+                result.failures.append(f"'{name}' depends on '{known}', which is not told")
 
 
-def _at_events(fmu: Fmu, found: _Found) -> None:
+def _at_events(fmu: Fmu, result: _Found) -> None:
     """An input that is set in event mode is there after the event."""
     inputs = _inputs(fmu, 0.1)
     if MODEL_EXCHANGE not in fmu.interfaces() or not inputs:
-        found.notes.append("it has no model exchange, or no inputs")
+        result.notes.append("it has no model exchange, or no inputs")
         return
     with _begun(fmu, MODEL_EXCHANGE) as instance:
         instance.require("EnterEventMode")
@@ -477,45 +481,45 @@ def _at_events(fmu: Fmu, found: _Found) -> None:
         read = instance.get(list(inputs))
     for (name, new), value in zip(inputs.items(), read, strict=True):
         if abs(value - new) > 1e-6 * max(abs(new), abs(value)):
-            found.failures.append(f"'{name}' was set to {new:.6g} at an event and is {value:.6g}")
+            result.failures.append(f"'{name}' was set to {new:.6g} at an event and is {value:.6g}")
 
 
-def _step_sizes(fmu: Fmu, found: _Found) -> None:
+def _step_sizes(fmu: Fmu, result: _Found) -> None:
     """Steps of any size are taken where the FMU says so; what smaller ones change is told."""
     if CO_SIMULATION not in fmu.interfaces():
-        found.notes.append("it has no co-simulation")
+        result.notes.append("it has no co-simulation")
         return
     size, co = _step(fmu), fmu.description.coSimulation
-    own = float(getattr(co, "fixedInternalStepSize", None) or 0.0)
+    item = float(getattr(co, "fixedInternalStepSize", None) or 0.0)
     ends = []
     for parts in (1, 2, 4):
-        if own and parts * own > size * (1 + 1e-9):
+        if item and parts * item > size * (1 + 1e-9):
             break
         with _begun(fmu, CO_SIMULATION) as instance:
             ends.append(_stepped(instance, size / parts, [0.1] * (parts * _STEPS))[-1])
     if len(ends) == 3:
         scale = np.maximum(np.abs(ends[2]), 1e-300)
         offs = [float(np.max(np.abs(e - ends[2]) / scale, initial=0.0)) for e in ends[:2]]
-        found.figure = offs[0]
-        found.notes.append(
+        result.figure = offs[0]
+        result.notes.append(
             f"steps of {size:g} s end {offs[0]:.2g}, half ones {offs[1]:.2g} off quarter ones"
         )
     if co.canHandleVariableCommunicationStepSize:
         with _begun(fmu, CO_SIMULATION) as instance:
             now = 0.0
             for part in (1, 3, 2, 1):
-                length = part * (own or size / 2)
+                length = part * (item or size / 2)
                 instance.step(now, length)
                 now += length
 
 
-def _finite(fmu: Fmu, found: _Found) -> None:
+def _finite(fmu: Fmu, result: _Found) -> None:
     """What a run shows are finite numbers."""
     for interface in fmu.interfaces():
         with _begun(fmu, interface) as instance:
             wrong = ~np.isfinite(np.atleast_2d(_run(instance))).all(axis=0)
         if wrong.any():
-            found.notes.append(f"{_WORDS[interface]}: {int(wrong.sum())} numbers are not finite")
+            result.notes.append(f"{_WORDS[interface]}: {int(wrong.sum())} numbers are not finite")
 
 
 def _once(instance: Instance, now: float, size: float) -> None:
@@ -525,7 +529,7 @@ def _once(instance: Instance, now: float, size: float) -> None:
         _evaluated(instance)
 
 
-def _speed(fmu: Fmu, found: _Found) -> None:
+def _speed(fmu: Fmu, result: _Found) -> None:
     """How long a step takes, and making an instance."""
     interface, size = fmu.interfaces()[0], _step(fmu)
     stop = float(getattr(fmu.description.defaultExperiment, "stopTime", None) or 100 * size)
@@ -543,7 +547,7 @@ def _speed(fmu: Fmu, found: _Found) -> None:
             count += 1
         each = (time.perf_counter() - begin) / max(1, count)
     what = f"a step of {size:g} s" if interface == CO_SIMULATION else "an evaluation"
-    found.notes.append(f"{what} takes {1e6 * each:.3g} us, an instance {1e3 * made:.3g} ms")
+    result.notes.append(f"{what} takes {1e6 * each:.3g} us, an instance {1e3 * made:.3g} ms")
 
 
 _LOOKS: dict[str, _Look] = {

@@ -52,9 +52,9 @@ class Playback:
 
 def played_again(fmu: Fmu, playback: Playback) -> CheckRow:
     """Return the row of a run that is repeated."""
-    found = _played(fmu, playback)
+    result = _played(fmu, playback)
     valid = np.isfinite(playback.expected)
-    error = found[valid] - playback.expected[valid]
+    error = result[valid] - playback.expected[valid]
     if playback.stated is None:
         size = float(np.ptp(playback.expected[valid])) or 1.0
         largest = float(np.max(np.abs(error))) / size
@@ -76,10 +76,10 @@ def _played(fmu: Fmu, p: Playback) -> FloatArray:
 
     def stepped(inputs: Signals) -> FloatArray:
         """Return the output at the times of the playback, stepped from knot to knot of inputs."""
-        found = co_simulate(
+        values = co_simulate(
             fmu, inputs.times, inputs, [p.output], tolerance=_TOLERANCE, values=dict(p.start)
         )
-        return np.asarray(found[np.isin(inputs.times, p.times), 0])
+        return np.asarray(values[np.isin(inputs.times, p.times), 0])
 
     def means(parts: int) -> Signals:
         """Return inputs held at the mean of both ends of a step, of which many parts are made."""
@@ -184,13 +184,13 @@ def _compared(fmu: Fmu, truth: Truth, run: Run) -> CheckRow:
     """Return the row of a run: the largest difference over the scale, and which output has it."""
     names = truth.compared
     if run.integrated:
-        found = integrate(fmu, run.times, run.inputs, names, tolerance=run.tolerance or run.limit)
+        values = integrate(fmu, run.times, run.inputs, names, tolerance=run.tolerance or run.limit)
     else:
-        found = co_simulate(
+        values = co_simulate(
             fmu, run.times, run.inputs, names, tolerance=run.tolerance, settled=truth.settled
         )
     scale = truth.scale if run.scale is None else run.scale
-    error = np.max(np.abs(found - run.expected), axis=0) / scale
+    error = np.max(np.abs(values - run.expected), axis=0) / scale
     worst = int(np.argmax(error))
     largest = float(error[worst])
     remark = f"largest in {names[worst]}, against the {run.by or truth.by}"

@@ -57,13 +57,13 @@ class Check:
         problems: list[str] = []
         figure = 0.0
         try:
-            found = self.run()
-            if isinstance(found, CheckRow):
-                return found
-            if isinstance(found, float):
-                figure = found
+            check_row = self.run()
+            if isinstance(check_row, CheckRow):
+                return check_row
+            if isinstance(check_row, float):
+                figure = check_row
             else:
-                problems.extend(found)
+                problems.extend(check_row)
                 figure = float(len(problems))
         except BREAKDOWNS as error:
             problems.append(f"the check stopped: {error}")

@@ -88,8 +88,8 @@ def wrong_nominals(fmu: Fmu) -> Iterator[str]:
             yield f"'{name}' has the nominal value {nominal:g}"
     states = fmu.states()
     with fmu.start(MODEL_EXCHANGE) as instance:
-        found = instance.vector("GetNominalsOfContinuousStates", len(states))
-    for name, nominal in zip(states, found, strict=True):
+        result = instance.vector("GetNominalsOfContinuousStates", len(states))
+    for name, nominal in zip(states, result, strict=True):
         if nominal != fmu.nominals[name]:
             yield f"'{name}' has another nominal value in the binary, {nominal:g}"
 
@@ -103,16 +103,16 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
         if entry.dependencies is None:
             yield f"'{entry.variable.name}' lists no dependencies"
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
-    found: dict[str, set[str]] = {name: set() for name in unknowns}
+    table: dict[str, set[str]] = {name: set() for name in unknowns}
     for instance, point in _at_points(fmu, 1):
         here = evaluate(instance, point, unknowns)
         for known in point:
             moved = {**point, known: point[known] * 1.01}
             changed = evaluate(instance, moved, unknowns) != here
             for name in np.array(unknowns)[changed]:
-                found[name].add(known)
+                table[name].add(known)
     claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
-    missing = {(name, known) for name, claimed in claims for known in found[name] - claimed}
+    missing = {(name, known) for name, claimed in claims for known in table[name] - claimed}
     for name, known in sorted(missing):
         yield f"'{name}' depends on '{known}', which its dependencies do not list"
 
@@ -198,10 +198,10 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
     for interface in fmu.interfaces():
         kind = "co-simulation" if interface == CO_SIMULATION else "model exchange"
         with fmu.start(interface) as instance:
-            found = instance.get(list(truth.starts))
+            result = instance.get(list(truth.starts))
         others = [
             (name, there, value)
-            for (name, value), there in zip(truth.starts.items(), found, strict=True)
+            for (name, value), there in zip(truth.starts.items(), result, strict=True)
             if abs(there - value) > _ROUNDING * (abs(value) + fmu.nominals[name])
         ]
         if others:
@@ -233,11 +233,11 @@ def equation_error(fmu: Fmu, truth: Truth) -> float:
     """Return the largest relative difference of derivatives and outputs from the model's."""
     unknowns, worst = [*(f"der({n})" for n in truth.state_names), *truth.output_names], 0.0
     for instance, point in _at_points(fmu, 3):
-        found = evaluate(instance, point, unknowns)
+        result = evaluate(instance, point, unknowns)
         xdot, y = truth.f(*_arguments(truth, point, instance))
         expected = np.concatenate([np.array(xdot).ravel(), np.array(y).ravel()])
-        size = np.abs(expected) + np.abs(found) + 1e-300
-        worst = max(worst, float(np.max(np.abs(found - expected) / size)))
+        size = np.abs(expected) + np.abs(result) + 1e-300
+        worst = max(worst, float(np.max(np.abs(result - expected) / size)))
     return worst
 
 
@@ -314,16 +314,16 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
 
 def _dead_or_not_turned(fmu: Fmu) -> Iterator[str]:
     """Yield the indicators that nothing moves, and those that an event leaves negative."""
-    names, seen = fmu.indicators(), []
+    names, observed = fmu.indicators(), []
     for instance, point in _at_points(fmu, 8):
-        seen.append(evaluate(instance, point, names))
+        observed.append(evaluate(instance, point, names))
         instance.require("EnterEventMode")
         instance.update_discrete_states()
         instance.require("EnterContinuousTimeMode")
         for name, z in zip(names, instance.get(names), strict=True):
             if not z >= 0.0:
                 yield f"'{name}' stays negative after an event"
-    for name, z in zip(names, np.array(seen).T, strict=True):
+    for name, z in zip(names, np.array(observed).T, strict=True):
         if not np.ptp(np.abs(z)) > 0.0:
             yield f"'{name}' moves with nothing"
 
@@ -334,12 +334,12 @@ def wrong_indicators(fmu: Fmu, truth: Truth) -> Iterator[str]:
         named = ", ".join(truth.switch_names) or "none"
         yield f"the event indicators are not those of the model: {named}"
         return
-    found, expected = [], []
+    result, expected = [], []
     for instance, point in _at_points(fmu, 5):
-        found.append(evaluate(instance, point, fmu.indicators()))
+        result.append(evaluate(instance, point, fmu.indicators()))
         expected.append(np.array(truth.switches(*_arguments(truth, point, instance))).ravel())
     for name, z, switch in zip(
-        fmu.indicators(), np.array(found).T, np.array(expected).T, strict=True
+        fmu.indicators(), np.array(result).T, np.array(expected).T, strict=True
     ):
         size = float(np.max(np.abs(switch)))
         margins = [z - switch, z + switch]

@@ -64,8 +64,8 @@ def at_rest(model: Model, expression: Expression) -> FloatArray:
     s = model.structure
     zeros = [np.zeros(len(part)) for part in (s.states, s.inputs)]
     held = [np.zeros(len(s.sampled))] if s.sampled else []
-    found = ca.Function("at_rest", s.arguments, [ca.densify(expression)])
-    return np.array(found(0.0, *zeros, model.parameter_vector(), *held))
+    function = ca.Function("at_rest", s.arguments, [ca.densify(expression)])
+    return np.array(function(0.0, *zeros, model.parameter_vector(), *held))
 
 
 def number(value: float) -> str:
@@ -73,12 +73,12 @@ def number(value: float) -> str:
     return repr(float(value))
 
 
-def xml_text(template: str, **given: object) -> str:
+def xml_text(template: str, **options: object) -> str:
     """Return an XML document from a template, indented anew; it ends with a line end.
 
     Raises InputError for a character that XML cannot carry, which a parser would stop at.
     """
-    text = filled(template, **given)
+    text = filled(template, **options)
     check_text(text, f"{re.findall(r'<(?:[a-z]+:)?([A-Za-z]+)', text)[0]}, an XML file,")
     for prefix, space in re.findall(r'xmlns:([a-z-]+)="([^"]+)"', text):
         ET.register_namespace(prefix, space)

@@ -50,9 +50,9 @@ def parameter_rows(model: Model, values: Mapping[str, float] | None = None) -> l
     intervals = model.provenance.intervals if values is None else {}
     chosen, rows = model.values if values is None else values, []
     for p in (p for p in model.structure.parameters if p.name in chosen):
-        found, meaning = intervals.get(p.name), p.description
-        if found:
-            meaning += f"; 95 % interval {found.low:.6g} to {found.high:.6g} {p.unit}"
+        result, meaning = intervals.get(p.name), p.description
+        if result:
+            meaning += f"; 95 % interval {result.low:.6g} to {result.high:.6g} {p.unit}"
         rows.append((p.name, meaning, chosen[p.name], p.unit))
     return rows
 
@@ -119,10 +119,10 @@ def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
         kept = np.clip(np.where(np.isnan(digits), mean, digits), low, high)
         return dict(zip(names, kept.tolist(), strict=True))
 
-    found = {"mean": dict(zip(names, mean.tolist(), strict=True))}
+    table = {"mean": dict(zip(names, mean.tolist(), strict=True))}
     for k, column in enumerate(factor.T, start=1):
-        found[f"sigma_{k:02d}_plus"] = within(moved(column))
-        found[f"sigma_{k:02d}_minus"] = within(moved(-column))
+        table[f"sigma_{k:02d}_plus"] = within(moved(column))
+        table[f"sigma_{k:02d}_minus"] = within(moved(-column))
     normal, draws = NormalDist(), random.Random(len(names))
     for k in range(1, samples + 1):
         for _ in range(_DRAWS):
@@ -130,8 +130,8 @@ def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
             drawn = moved(factor @ np.array(z))
             if np.all((low <= drawn) & (drawn <= high)):
                 break
-        found[f"sample_{k:02d}"] = within(drawn)
-    return found
+        table[f"sample_{k:02d}"] = within(drawn)
+    return table
 
 
 def _factor(covariance: FloatArray) -> FloatArray:

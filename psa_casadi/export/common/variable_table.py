@@ -75,9 +75,9 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
 
     def declared(kind: str, listed: Sequence[State | Input | Output]) -> Iterator[Variable]:
         for i, q in enumerate(listed):
-            shown = _SHOWN if kind == "state" and q.nominal is velocity_scale else 1.0
+            displayed = _SHOWN if kind == "state" and q.nominal is velocity_scale else 1.0
             start = None if isinstance(q, Output) else q.start
-            size = shown * nominal_value(q.nominal, values)
+            size = displayed * nominal_value(q.nominal, values)
             yield Variable(q.name, kind, i, q.unit, q.description, q.display_unit, start, size)
 
     table = [

@@ -134,18 +134,18 @@ class Printer:
         one, none = self.precision.literal(1.0), self.precision.literal(0.0)
         if kind == "v_if":
             return f"{self._condition(arguments[0])} ? {self._name(arguments[1])} : {none}"
-        given = [self._name(a) for a in arguments]
+        items = [self._name(a) for a in arguments]
         if kind == "neg":
-            return f"-({given[0]})"
+            return f"-({items[0]})"
         if kind in ("+", "-", "*", "/"):
-            right = f"({given[1]})" if given[1].startswith("-") else given[1]
-            return f"{given[0]} {kind} {right}"
+            right = f"({items[1]})" if items[1].startswith("-") else items[1]
+            return f"{items[0]} {kind} {right}"
         if kind in ("v_fmin", "v_fmax"):
             sign = "<" if kind == "v_fmin" else ">"
-            return f"{given[0]} {sign} {given[1]} ? {given[0]} : {given[1]}"
+            return f"{items[0]} {sign} {items[1]} ? {items[0]} : {items[1]}"
         if kind == "v_sign":
-            return f"{given[0]} > {none} ? {one} : ({given[0]} < {none} ? -{one} : {none})"
-        return f"{_FUNCTIONS[kind]}{self.precision.suffix}({', '.join(given)})"
+            return f"{items[0]} > {none} ? {one} : ({items[0]} < {none} ? -{one} : {none})"
+        return f"{_FUNCTIONS[kind]}{self.precision.suffix}({', '.join(items)})"
 
     def _last_uses(self, computed: Sequence[int], outputs: Sequence[int]) -> dict[int, list[int]]:
         """Return the numbers of which each of `computed` is the last user, by it.
@@ -155,11 +155,11 @@ class Printer:
         places = set(computed)
 
         def used_by(n: int) -> set[int]:
-            found = set[int]()
+            table = set[int]()
             kind, *arguments = self._graph.nodes[n]
             for a in arguments if kind not in LEAVES else ():
-                found |= {a} if a in places else used_by(a)
-            return found
+                table |= {a} if a in places else used_by(a)
+            return table
 
         kept = {n for q in outputs for n in ({q} if q in places else used_by(q))}
         last = {a: n for n in computed for a in used_by(n)}
@@ -170,15 +170,15 @@ class Printer:
         return ends
 
 
-def _constant(kind: str, given: Sequence[float]) -> float:
+def _constant(kind: str, numbers: Sequence[float]) -> float:
     """Return the value of an operation on constants."""
     if kind == "neg":
-        return -given[0]
+        return -numbers[0]
     if kind == "v_sqrt":
-        return float(np.sqrt(given[0]))
+        return float(np.sqrt(numbers[0]))
     if kind not in ("+", "-", "*", "/"):
         raise Unprintable(f"operation {kind} on constants")
-    a, b = given
+    a, b = numbers
     return {"+": a + b, "-": a - b, "*": a * b, "/": a / b if b else float("nan")}[kind]
 
 
@@ -240,11 +240,11 @@ def check_names(plan: CodePlan) -> None:
         InputError: a state, an input or an output has the name of a keyword or of another field.
     """
     s = plan.model.structure
-    own = ["last_input", "steps_done", "steps_to_instant", "unused"]
-    own += [f"low_of_{q.name}" for q in s.states]
-    own += [f"port_of_{q}" for q in plan.expression.port_names]
+    items = ["last_input", "steps_done", "steps_to_instant", "unused"]
+    items += [f"low_of_{q.name}" for q in s.states]
+    items += [f"port_of_{q}" for q in plan.expression.port_names]
     names = [q.name for table in (s.states, s.sampled, s.inputs, s.outputs) for q in table]
-    wrong = sorted({n for n in names if n in _KEYWORDS.split() or n in own})
+    wrong = sorted({n for n in names if n in _KEYWORDS.split() or n in items})
     if wrong:
         raise InputError(
             f"{', '.join(wrong)} cannot name a field in C, where it is a keyword or taken; rename"
@@ -295,9 +295,9 @@ def function_code(plan: CodePlan, function: str) -> str:
         },
     )
     lines, texts = printer.lines([change])
-    given = "double t, double *x, const double *u, const double *change"
+    text = "double t, double *x, const double *u, const double *change"
     return filled(
-        "fixed_function.c", function=function, given=given, lines=lines, texts=texts, plan=plan,
+        "fixed_function.c", function=function, given=text, lines=lines, texts=texts, plan=plan,
         nothing=_nothing(plan), inputs=len(s.inputs),
     )  # fmt: skip
 
@@ -385,12 +385,12 @@ def _without_change(plan: CodePlan) -> list[Expression]:
     """
     e, s = plan.expression, plan.model.structure
     away = [*([] if plan.precision.single else [e.low]), *([e.du] if plan.held else [])]
-    given = [ca.SX.zeros(q.numel()) for q in away]
+    items = [ca.SX.zeros(q.numel()) for q in away]
     still = ca.vertcat(s.u, s.z) if plan.held else s.z
     if still.numel():
         jump = [k for k in range(e.port.numel()) if ca.depends_on(e.port_start[k], still)]
         values = [e.port_start[k] if k in jump else e.port[k] for k in range(e.port.numel())]
         away.append(e.port)
-        given.append(ca.vertcat(ca.SX(0, 1), *values))
+        items.append(ca.vertcat(ca.SX(0, 1), *values))
     both = [e.change, e.port_end]
-    return list(ca.substitute(both, away, given)) if away else both
+    return list(ca.substitute(both, away, items)) if away else both

@@ -103,9 +103,9 @@ class Probe:
 
     def play(self, u: FloatArray) -> FloatArray:
         """Return all outputs (n - 1, ny) after each step of inputs (n, nu), from the start on."""
-        given = np.ascontiguousarray(u, dtype=np.float64)
+        inputs = np.ascontiguousarray(u, dtype=np.float64)
         y = np.empty((len(u) - 1, len(self._plan.model.output_names)))
-        self._play(len(u), given.ctypes.data, y.ctypes.data)
+        self._play(len(u), inputs.ctypes.data, y.ctypes.data)
         return y
 
 
@@ -154,9 +154,9 @@ def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
     hold = "zero" if plan.held else "linear"
     true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
     # held inputs hold from the instant on that they are given for
-    own = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
+    item = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
     size = float(np.ptp(true)) or float(model.output_nominals()[output])
-    worst = float(np.max(np.abs(own - true))) / size
+    worst = float(np.max(np.abs(item - true))) / size
     return worst if np.isfinite(worst) else float("inf")
 
 
@@ -208,7 +208,7 @@ def fixed_step(
             f"The model '{model.name}' reads its inputs at sample instants; --hold zero is for"
             " inputs of continuous models: leave it out."
         )
-    found: list[FixedStep] = []
+    fixed_steps: list[FixedStep] = []
     counts = SUBSTEPS if model.structure.states else SUBSTEPS[:1]
     for count in counts if substeps is None else (substeps,):
         attempt = partial(
@@ -219,11 +219,11 @@ def fixed_step(
         texts = {f"{name}.h": header_code(plan), f"{name}.c": source}
         measured = errors(plan, texts)
         texts[f"{name}.h"] = header_code(plan, measured)
-        found.append(FixedStep(plan, texts, measured))
-        if found[-1].worst.error <= GOOD:
+        fixed_steps.append(FixedStep(plan, texts, measured))
+        if fixed_steps[-1].worst.error <= GOOD:
             break
-    good = [f for f in found if f.worst.error <= GOOD]
-    best = (good or sorted(found, key=lambda f: f.worst.error))[0]
+    good = [f for f in fixed_steps if f.worst.error <= GOOD]
+    best = (good or sorted(fixed_steps, key=lambda f: f.worst.error))[0]
     if not best.worst.error <= USELESS:
         raise InputError(_useless(best))
     # the voltage is limited to where the step is as good as on the reference ones
@@ -284,24 +284,24 @@ def _planned(model: Model, attempt: Attempt) -> tuple[code.CodePlan, str]:
 
     Raises InputError where the model does not fit, with the effect to blame and the reason.
     """
-    found = attempt(model)
-    if not isinstance(found, str):
-        code.check_names(found[0])
-        return found
-    own, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
-    for name in (c.name for c in model.components if c.name not in own):
+    result = attempt(model)
+    if not isinstance(result, str):
+        code.check_names(result[0])
+        return result
+    item, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
+    for name in (c.name for c in model.components if c.name not in item):
         with suppress(InputError):  # where others need it
             if not isinstance(attempt(model.without([name])), str):
                 blamed.append(name)
     if not blamed:
         raise InputError(
-            f"The model '{model.name}' has no step of fixed length and constant cost: {found}."
+            f"The model '{model.name}' has no step of fixed length and constant cost: {result}."
             " Export an FMU with the adaptive solver."
         )
     who = " or ".join(f"'{name}'" for name in blamed)
     raise InputError(
         f"The effect {who} does not fit a step of fixed length and constant cost: with it the"
-        f" model is not of the form that is needed ({found}). Leave the effect out, or export an"
+        f" model is not of the form that is needed ({result}). Leave the effect out, or export an"
         " FMU with the adaptive solver."
     )
 
@@ -383,17 +383,17 @@ def export_c(
     refuse_foreign(model.structure, "C")
     exported = model if include_sensor else model.plant()
     identifier = name or model.name
-    found = fixed_step(
+    result = fixed_step(
         exported, name=identifier, step=step, precision=precision, hold=hold, substeps=substeps
     )
     folder = Path(directory)
     make_folder(folder)
-    for file_name, text in found.texts.items():
+    for file_name, text in result.texts.items():
         atomic_write(folder / file_name, text)
     return CodeExport(
         folder / f"{identifier}.h",
         folder / f"{identifier}.c",
-        found.plan.substeps,
-        found.errors,
-        found.plan.limit,
+        result.plan.substeps,
+        result.errors,
+        result.plan.limit,
     )

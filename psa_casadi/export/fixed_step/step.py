@@ -108,8 +108,8 @@ def along_the_way(
         for i in states:
             parts[i] = origin[i]
         x = shifted(ca.vertcat(*parts), gone)
-        given = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
-        return way, *rosenbrock(duration * slopes(*given), theta, gone)
+        inputs = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
+        return way, *rosenbrock(duration * slopes(*inputs), theta, gone)
 
     first = leg(ends.x, meeting, ca.SX(0), share)
     last = leg(shifted(meeting, first[2]), ends.x + ends.whole, share, 1.0 - share)
@@ -301,12 +301,12 @@ class _Builder:
         slopes = []
         for i in range(len(rows)):
             scale = m[i, i] or 1.0
-            own = x[i] if m[i, i] else ca.SX(0)
+            item = x[i] if m[i, i] else ca.SX(0)
             others = sum(
                 (m[i, j] / scale * x[j] for j in range(len(rows)) if j != i and m[i, j]), ca.SX(0)
             )
-            given = sum((b[i, j] / scale * s.u[j] for j in range(b.shape[1]) if b[i, j]), ca.SX(0))
-            rest = own + given + others + self.c[i, 0] / scale
+            inputs = sum((b[i, j] / scale * s.u[j] for j in range(b.shape[1]) if b[i, j]), ca.SX(0))
+            rest = item + inputs + others + self.c[i, 0] / scale
             slopes.append(scale * (rest + low[i] if m[i, i] else rest))
         for k, port in enumerate(self.split.ports):
             slopes[rows.index(port.state)] += self.port[k]
@@ -323,8 +323,8 @@ class _Builder:
         """Return an expression at a node, where the states have changed as far as it is known."""
         s, share = self.split.structure, SHARES[node]
         there = [s.time + share * self.step, s.x + self._change(node), s.u + share * self.du]
-        given = with_numbers(self.model, expression)
-        return ca.substitute([given], [s.time, s.x, s.u], there)[0]
+        inputs = with_numbers(self.model, expression)
+        return ca.substitute([inputs], [s.time, s.x, s.u], there)[0]
 
     def _respond(self, k: int) -> None:
         """Add the response to a port, once its values at the half and the end are known."""
@@ -341,8 +341,8 @@ class _Builder:
         guess = ca.SX.sym("guess", len(places))
         before = [ca.SX(q) for q in self.moved]
         self._take(places, guess)
-        found = [self._at(node, self.split.ports[k].value) for node, k in places]
-        miss = ca.vertcat(*found) - guess
+        items = [self._at(node, self.split.ports[k].value) for node, k in places]
+        miss = ca.vertcat(*items) - guess
         slopes = ca.jacobian(miss, guess)
         values = ca.vertcat(*[self.port[k] for _, k in places])
         for _ in range(_NEWTON):
@@ -368,8 +368,8 @@ class _Builder:
             step=self.step, time=s.time, x=s.x, u=s.u, du=self.du,
             half=self._change(HALF), whole=self._change(WHOLE),
         )  # fmt: skip
-        found = along_the_way(ends, group.driver, group.states, self._rates(group.driver), slopes)
-        for node, change in enumerate(found):
+        result = along_the_way(ends, group.driver, group.states, self._rates(group.driver), slopes)
+        for node, change in enumerate(result):
             for place, i in enumerate(group.states):
                 self.turned[node][i] = change[place]
 
@@ -400,18 +400,18 @@ def step_of(model: Model, step: float) -> StepExpression | str:
         return "its equations jump"
     held, split = replace(model, structure=between), split_of(between)
     if isinstance(split, str):
-        found = whole_step(held, step)
+        step_expression = whole_step(held, step)
     else:
-        found = _Builder(held, split, step).built()
+        step_expression = _Builder(held, split, step).built()
     count = s.u.numel()
-    still = found.du[count:, 0]
+    still = step_expression.du[count:, 0]
 
     def resting(expression: Expression) -> Expression:
         return ca.substitute(expression, still, ca.SX.zeros(still.numel()))
 
     return replace(
-        found, u=s.u, du=found.du[:count, 0],
-        change=resting(found.change), port_end=resting(found.port_end),
+        step_expression, u=s.u, du=step_expression.du[:count, 0],
+        change=resting(step_expression.change), port_end=resting(step_expression.port_end),
     )  # fmt: skip
 
 

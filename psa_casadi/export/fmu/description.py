@@ -63,11 +63,11 @@ def dependencies(structure: Structure) -> dict[Key, dict[Key, str]]:
         varied = "tunable" if names <= tunable else "dependent"
         direct[unknowns[row]][knowns[column]] = varied if names else "constant"
     result = {}
-    for unknown, found in direct.items():
+    for unknown, matches in direct.items():
         if unknown[0] != "next":
-            sources = [direct["next", index] for kind, index in found if kind == "sampled"]
+            sources = [direct["next", index] for kind, index in matches if kind == "sampled"]
             through = {known: "dependent" for source in sources for known in source}
-            result[unknown] = {**found, **through}
+            result[unknown] = {**matches, **through}
     return result
 
 
@@ -76,18 +76,18 @@ def at_the_start(model: Model) -> dict[Key, dict[Key, str]]:
 
     Where it has the parameter `start_voltage`, states and voltage start as that has it.
     """
-    found = dependencies(model.structure)
+    table = dependencies(model.structure)
     if not starts_at_voltage(model):
-        return found
+        return table
     voltage = model.input_names.index("voltage")
     moved = {("input", voltage), *(("state", i) for i in range(len(model.state_names)))}
     through: dict[Key, str] = {("option", START_INDEX): "dependent"}
-    return {u: {**how, **through} if moved & how.keys() else how for u, how in found.items()}
+    return {u: {**how, **through} if moved & how.keys() else how for u, how in table.items()}
 
 
-def without_sampled(found: dict[Key, str]) -> dict[Key, str]:
+def without_sampled(texts: dict[Key, str]) -> dict[Key, str]:
     """Return what a variable depends on after the initialisation, when no sampled state is set."""
-    return {key: how for key, how in found.items() if key[0] != "sampled"}
+    return {key: how for key, how in texts.items() if key[0] != "sampled"}
 
 
 def model_description(
@@ -104,10 +104,10 @@ def model_description(
     `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
-    said, span, places = describe(model), default_span(model), range(1, len(table) + 1)
+    statement, span, places = describe(model), default_span(model), range(1, len(table) + 1)
     size = span / 1000.0
     if fixed:
-        said += (
+        statement += (
             f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication"
             f" step is a multiple; largest error {fixed.worst.error:.1e} of the range"
             f" ({fixed.worst.voltage})."
@@ -120,7 +120,7 @@ def model_description(
         head={
             "modelName": model.name,
             "guid" if second else "instantiationToken": token,
-            "description": said,
+            "description": statement,
             **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
@@ -146,8 +146,8 @@ def _units(table: Iterable[Variable]) -> list[tuple[str, dict[str, str] | None, 
     displays: dict[str, set[str]] = {}
     for variable in table:
         if variable.unit:
-            shown = displays.setdefault(variable.unit, set())
-            shown |= {variable.display_unit} if variable.display_unit else set()
+            displayed = displays.setdefault(variable.unit, set())
+            displayed |= {variable.display_unit} if variable.display_unit else set()
 
     def display(name: str, unit: Unit) -> Attributes:
         other = parse_unit(name)  # value shown = factor * value + offset
@@ -156,13 +156,13 @@ def _units(table: Iterable[Variable]) -> list[tuple[str, dict[str, str] | None, 
         moved = unit.offset != other.offset
         return {"name": name, "factor": factor, "offset": offset if moved else None}
 
-    found = []
+    items = []
     for name in sorted(displays):
         unit = parse_unit(name)
         whole = all(isinstance(power, int) for power in unit.exponents)  # FMI has no m2.5
         ways = [display(other, unit) for other in sorted(displays[name])]
-        found.append((name, base_unit(unit) if whole else None, ways))
-    return found
+        items.append((name, base_unit(unit) if whole else None, ways))
+    return items
 
 
 def _type_name(unit: str) -> str | None:
@@ -192,7 +192,7 @@ def _structure(
 
     An InitialUnknown knows no "tunable": there it is "dependent".
     """
-    found, at_start = dependencies(model.structure), at_the_start(model)
+    result, at_start = dependencies(model.structure), at_the_start(model)
     places = {(v.kind, v.index): place for place, v in enumerate(table, start=1)}
     outputs, rates, indicators = (
         [key for key in places if key[0] == kind] for kind in ("output", "derivative", "indicator")
@@ -200,7 +200,7 @@ def _structure(
     initial = sorted([*outputs, *rates], key=places.__getitem__)
 
     def stated(unknown: Key, *, initially: bool) -> Attributes:
-        listed = at_start[unknown] if initially else without_sampled(found[unknown])
+        listed = at_start[unknown] if initially else without_sampled(result[unknown])
         known = sorted(
             (places[key], "dependent" if initially and kind != "constant" else kind)
             for key, kind in listed.items()

@@ -109,8 +109,8 @@ def _shown(value: float | None, variable: Variable, digits: int = 6) -> str:
     if value is None:
         return ""
     unit = variable.display_unit or variable.unit
-    shown = f"{convert(value, variable.unit, unit):.{digits}g}"
-    return shown if unit == "1" else f"{shown} {unit}"
+    text = f"{convert(value, variable.unit, unit):.{digits}g}"
+    return text if unit == "1" else f"{text} {unit}"
 
 
 def _parameters(model: Model, table: Sequence[Variable]) -> dict[str, object]:
@@ -119,8 +119,8 @@ def _parameters(model: Model, table: Sequence[Variable]) -> dict[str, object]:
     figures = {n: f for k in named for n, f in k.values.items() if model.values.get(n) == f.value}
     rows = []
     for v in (v for v in table if v.kind == "parameter"):
-        found, figure = model.provenance.intervals.get(v.name), figures.get(v.name)
-        interval = f"{_shown(found.low, v)} to {_shown(found.high, v)}" if found else ""
+        result, figure = model.provenance.intervals.get(v.name), figures.get(v.name)
+        interval = f"{_shown(result.low, v)} to {_shown(result.high, v)}" if result else ""
         low, high = (_shown(b, v) if math.isfinite(b) else "" for b in v.bounds or ())
         source = ("assumed: " if figure.assumed else "") + figure.source if figure else ""
         row = (v.name, _shown(v.start, v), interval, f"{low} to {high}", v.description, source)

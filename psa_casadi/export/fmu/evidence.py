@@ -50,13 +50,13 @@ def with_validity(model: Model) -> Model:
             f" output '{OUTPUT}'; give a file that `psa identify` or `psa diagnose` of this version"
             " wrote."
         )
-    seen = model.evidence.seen
+    observed = model.evidence.seen
     values = {
-        "seen_voltage_low": seen.voltage.low,
-        "seen_voltage_high": seen.voltage.high,
-        "seen_voltage_rate": max(seen.rate, 1e-9),
+        "seen_voltage_low": observed.voltage.low,
+        "seen_voltage_high": observed.voltage.high,
+        "seen_voltage_rate": max(observed.rate, 1e-9),
     }
-    warm = seen.temperature if "temperature" in model.input_names else None
+    warm = observed.temperature if "temperature" in model.input_names else None
     if warm is not None:
         values |= {"seen_temperature_low": warm.low, "seen_temperature_high": warm.high}
     component = VALIDITY if warm is None else VALIDITY_WITH_TEMPERATURE
@@ -68,12 +68,12 @@ def with_validity(model: Model) -> Model:
 def seen_inputs(model: Model) -> list[tuple[float, float, float]]:
     """Return least, largest value and rate of each input in the records, infinite if not known."""
     rows = []
-    seen = model.evidence.seen if model.evidence else None
-    known = {"voltage": seen.voltage, "temperature": seen.temperature} if seen else {}
+    observed = model.evidence.seen if model.evidence else None
+    known = {"voltage": observed.voltage, "temperature": observed.temperature} if observed else {}
     for name in model.input_names:
-        found = known.get(name)
-        low, high = (found.low, found.high) if found else (-math.inf, math.inf)
-        rows.append((low, high, seen.rate if seen and name == "voltage" else math.inf))
+        result = known.get(name)
+        low, high = (result.low, result.high) if result else (-math.inf, math.inf)
+        rows.append((low, high, observed.rate if observed and name == "voltage" else math.inf))
     return rows
 
 
@@ -111,8 +111,8 @@ def evidence_files(model: Model, samples: int) -> dict[str, bytes]:
     if START in texts:
         times, inputs = run_inputs(model)
         start = np.array(list(run_start(model).values()))
-        found = run(model, times, inputs, start, rtol=OWN_TOLERANCE)
-        texts[OUTPUTS] = csv_table(("time", *model.output_names), times, rounded(found.y))
+        result = run(model, times, inputs, start, rtol=OWN_TOLERANCE)
+        texts[OUTPUTS] = csv_table(("time", *model.output_names), times, rounded(result.y))
     return {place: text.encode("utf-8") for place, text in texts.items()}
 
 
@@ -120,12 +120,12 @@ def related_files(model: Model, places: Collection[str]) -> dict[str, Related]:
     """Return what the manifest says of files of evidence at these places."""
     reference = model.evidence.reference if model.evidence else None
     run_ = _said(reference) if reference else ""
-    found = {}
+    table = {}
     for known, (kind, role, meaning) in RELATED.items():
         for place in places:
             if place == known or place.startswith(f"{known}/"):
-                found[place] = kind, role, meaning.format(run=run_, set=_set_name(place))
-    return found
+                table[place] = kind, role, meaning.format(run=run_, set=_set_name(place))
+    return table
 
 
 def evidence_texts(model: Model, samples: int) -> dict[str, str]:
@@ -164,13 +164,13 @@ def evidence_texts(model: Model, samples: int) -> dict[str, str]:
 
 def set_files(model: Model, samples: int) -> dict[str, str]:
     """Return the parameter sets within the uncertainty by their place in the archive."""
-    found = posterior_sets(model, samples) if samples > 0 else {}
-    return {f"{SETS}/{n}.ssv": parameter_set(model, v, name=n) for n, v in found.items()}
+    result = posterior_sets(model, samples) if samples > 0 else {}
+    return {f"{SETS}/{n}.ssv": parameter_set(model, v, name=n) for n, v in result.items()}
 
 
 def evidence_page(model: Model, meta: str) -> str:
     """Return the page on a model's evidence, which says what the meta data say."""
-    told = {
+    table = {
         part.attrib["type"].removeprefix("psa_casadi."): [
             (e.attrib["keyword"], e.text)
             for e in part
@@ -181,7 +181,7 @@ def evidence_page(model: Model, meta: str) -> str:
     text = filled(
         "evidence.html",
         title=f"{model.name}: evidence",
-        told=told,
+        told=table,
         validation=VALIDATION,
         sets=SETS,
     )

@@ -105,8 +105,8 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
         )
     chosen: dict[str, Platform] = {}
     for name in names:
-        found = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
-        chosen.update({p.name: p for p in found})
+        result = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
+        chosen.update({p.name: p for p in result})
     if {*names} != {"host"} and not has_zig():
         raise InputError(
             f"The machine's own compiler makes binaries for systems like this one alone; for"

@@ -55,13 +55,13 @@ def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, by
     times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
     outputs = rounded(run(model, times, inputs, start, rtol=OWN_TOLERANCE).y)
-    said = f"straight segments of every input of {model.name}"
+    statement = f"straight segments of every input of {model.name}"
     files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
     texts = {
         INPUTS: csv_table(("time", *model.input_names), times, inputs),
         OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
         PARAMETERS: parameter_set(model),
-        EXPERIMENTS: experiments("smoke test", times, [("segments", said, files)]),
+        EXPERIMENTS: experiments("smoke test", times, [("segments", statement, files)]),
         "fmi-ls-manifest.xml": _manifest(more),
     }
     notes = filled(
@@ -182,8 +182,8 @@ def held_step(model: Model) -> HeldStep | None:
     def error(parts: int) -> float:
         grid = np.linspace(times[0], times[-1], parts * (len(times) - 1) + 1)
         fine = np.array([np.interp(grid, times, c) for c in inputs.T]).T
-        found = run(model, grid, fine, start, rtol=_HELD_TOLERANCE, hold="zero").y[::parts, column]
-        return float(np.max(np.abs(found - truth))) / span
+        result = run(model, grid, fine, start, rtol=_HELD_TOLERANCE, hold="zero").y[::parts, column]
+        return float(np.max(np.abs(result - truth))) / span
 
     parts, worst = _FIRST, error(_FIRST)
     wanted = min(_MOST, max(1, math.ceil(parts * worst / SHARE)))

@@ -167,7 +167,7 @@ def _data(model: Model, identifier: str, token: str) -> str:
     nominals = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
     kinds = [("SETTLES" if q.settles else "STAYS") if q.memory else "NONE" for q in s.states]
     gains = {c.gain for c in model.effects}
-    seen = [f"{{{', '.join(map(_number, row))}}}" for row in seen_inputs(model)]
+    items = [f"{{{', '.join(map(_number, row))}}}" for row in seen_inputs(model)]
     return filled(
         "fmi_data.c",
         token=token,
@@ -182,7 +182,7 @@ def _data(model: Model, identifier: str, token: str) -> str:
             ("int", "memory", "NX", [*(f"PSA_MEMORY_{kind}" for kind in kinds), "0"]),
             ("int", "gains", "NP", [*(str(int(n in gains)) for n in model.parameter_names), "0"]),
             ("double", "switch_scales", "NZ", numbers(switch_scales(model, nominals))),
-            ("psa_range", "seen", "NU", [*seen, "{0.0, 0.0, 0.0}"]),
+            ("psa_range", "seen", "NU", [*items, "{0.0, 0.0, 0.0}"]),
         ),
         duration=_number(model.evidence.seen.duration if model.evidence else math.inf),
     )
@@ -216,8 +216,8 @@ def fixed_step_of(directory: Path) -> float | None:
     header = directory / "sources" / _HEADER
     try:
         text = header.read_text("utf-8")
-        found = re.search(r"^#define PSA_FIXED_STEP (\S+)$", text, re.MULTILINE)
-        return float(found[1]) if found else None
+        result = re.search(r"^#define PSA_FIXED_STEP (\S+)$", text, re.MULTILINE)
+        return float(result[1]) if result else None
     except (OSError, ValueError):  # no text, or no number: it is no file of ours
         return None
 

@@ -43,8 +43,8 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
 
     Where names or sizes are wrong the content is not looked at. Raises nothing for any content.
     """
-    found = {row: Problems() for row in ("archive names", "archive size", "archive intact")}
-    names, size, damage = found.values()
+    table = {row: Problems() for row in ("archive names", "archive size", "archive intact")}
+    names, size, damage = table.values()
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -56,22 +56,22 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
                 damage.add(f"{bad!a} is damaged")
     except _DAMAGE as error:
         damage.add(f"the archive is damaged ({' '.join(ascii(str(error))[1:-1].split())})")
-    return {row: problems.sentences() for row, problems in found.items()}
+    return {row: problems.sentences() for row, problems in table.items()}
 
 
 def _wrong_names(entries: list[zipfile.ZipInfo]) -> Iterator[str]:
     """Yield entries that are no plain files at a place of their own inside the folder."""
     for entry in entries:
         name, mode = entry.orig_filename, entry.external_attr >> 16
-        shown = ascii(name[:80])
+        displayed = ascii(name[:80])
         if name.startswith("/") or "\\" in name or ":" in name or ".." in name.split("/"):
-            yield f"{shown} leads outside the archive's folder"
+            yield f"{displayed} leads outside the archive's folder"
         if not name.isprintable():
-            yield f"{shown} has control characters"
+            yield f"{displayed} has control characters"
         if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            yield f"{shown} is a link or a device"
+            yield f"{displayed} is a link or a device"
         if entry.flag_bits & 0x1:
-            yield f"{shown} is encrypted"
+            yield f"{displayed} is encrypted"
     same = {(e.filename.removesuffix("/"), e.CRC, e.file_size) for e in entries}  # a repeat is none
     for place, count in Counter(name.casefold() for name, *_ in same).items():
         if count > 1:
@@ -94,7 +94,7 @@ def unpack(path: Path, folder: Path) -> None:
 
     Raises InputError, before anything is written, if the archive has any of `archive_problems`.
     """
-    problems = [p for found in archive_problems(path).values() for p in found]
+    problems = [p for result in archive_problems(path).values() for p in result]
     if problems:
         raise InputError(f"{path}: {'; '.join(problems)}.")
     try:
@@ -166,15 +166,15 @@ class Archive:
                     f" {LONGEST_TEXT >> 20} MiB and is not read; export the FMU again."
                 )
         self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
-        said = str(self.description.fmiVersion)
+        statement = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
-        if said[:2] not in ("2.", "3.") or interface is None:
+        if statement[:2] not in ("2.", "3.") or interface is None:
             raise InputError(
-                f"{self.path}: is of FMI {said} and has"
+                f"{self.path}: is of FMI {statement} and has"
                 f" {'no' if interface is None else 'an'} interface for model exchange or"
                 " co-simulation; give one of FMI 2.0 or FMI 3.0 that has one of these."
             )
-        self.version = int(said[0])
+        self.version = int(statement[0])
         self._read_flag()
         self.identifier = str(interface.modelIdentifier)
         if not _IDENTIFIER.fullmatch(self.identifier):  # it names the file that is loaded
@@ -211,8 +211,8 @@ class Archive:
             if v.type in _NO_NUMBERS:
                 continue
             shape = [_size(d) for d in v.dimensions]
-            count, said = math.prod(shape), str(v.start if v.start is not None else "").split()
-            starts = [_number(word) for word in said] or [0.0]
+            count, statement = math.prod(shape), str(v.start if v.start is not None else "").split()
+            starts = [_number(word) for word in statement] or [0.0]
             starts = starts if len(starts) == count else starts[:1] * count
             places = product(*(range(1, size + 1) for size in shape))
             for k, place in enumerate(places):
@@ -228,8 +228,8 @@ class Archive:
 
     def interfaces(self) -> tuple[int, ...]:
         """Return which of co-simulation (1) and model exchange (0) the description announces."""
-        said = ((1, self.description.coSimulation), (0, self.description.modelExchange))
-        return tuple(kind for kind, announced in said if announced is not None)
+        statement = ((1, self.description.coSimulation), (0, self.description.modelExchange))
+        return tuple(kind for kind, announced in statement if announced is not None)
 
     @property
     def token(self) -> str:
@@ -269,8 +269,8 @@ class Archive:
 
 def _size(dimension: Any) -> int:
     """Return the size of a dimension: its number, or the start of what sets it."""
-    said = dimension.start if dimension.variable is None else dimension.variable.start
-    return int(said or 0)
+    statement = dimension.start if dimension.variable is None else dimension.variable.start
+    return int(statement or 0)
 
 
 def _number(word: str) -> float:

@@ -166,8 +166,8 @@ class Instance:
         try:
             self.fmi.instantiate(**options)
         except Exception as error:  # fmpy's only one
-            said = self.messages or "no message"
-            raise FmuError(f"the FMU gives no instance: {said}") from error
+            statement = self.messages or "no message"
+            raise FmuError(f"the FMU gives no instance: {statement}") from error
 
     def _log(self, *arguments: Any) -> None:
         self.messages.append((arguments[-1] or b"").decode(errors="replace"))
@@ -177,8 +177,8 @@ class Instance:
         try:
             return type(self.fmi)._call(self.fmi, function, *arguments)
         except fmi1.FMICallException as error:
-            said = self.messages[-1] if self.messages else NO_MESSAGE
-            text = f"{function} returned status {error.status}: {said}"
+            statement = self.messages[-1] if self.messages else NO_MESSAGE
+            text = f"{function} returned status {error.status}: {statement}"
             raise FmuError(text, error.status) from None
 
     def __enter__(self) -> Self:
@@ -224,19 +224,19 @@ class Instance:
 
     def get(self, names: Sequence[str]) -> FloatArray:
         """Return the values of variables whose type is a number, and of elements of arrays."""
-        found = np.empty(len(names))
+        result = np.empty(len(names))
         for g in self.fmu.groups(tuple(names)):
             sizes = () if self.fmu.version == 2 else (len(g.starts),)
             values = getattr(self.fmi, f"get{g.type}")(g.references, *sizes)
-            found[g.rows] = np.array(values, dtype=float)[g.places]
-        return found
+            result[g.rows] = np.array(values, dtype=float)[g.places]
+        return result
 
     def set(self, values: Mapping[str, float]) -> None:
         """Set variables; elements of arrays that are not given are set to their starts."""
-        given = np.array(list(values.values()), dtype=float)
+        inputs = np.array(list(values.values()), dtype=float)
         for g in self.fmu.groups(tuple(values)):
             every = np.array(g.starts)
-            every[g.places] = given[g.rows]
+            every[g.places] = inputs[g.rows]
             real = g.type in ("Real", "Float64", "Float32")
             whole = every if real else [int(v) for v in np.rint(every)]
             getattr(self.fmi, f"set{g.type}")(g.references, whole)

@@ -67,18 +67,18 @@ def read_variables(
     )
     if not whole:
         outputs = {n: v for n, v in outputs.items() if v.type in _REALS}
-    begun = _begun(fmu) if whole else set[str]()
-    own = {n for n, v in rows.items() if v.causality == "parameter"} | begun
-    fixed = own | {n for n, v in rows.items() if v.causality == "input"}
+    started = _begun(fmu) if whole else set[str]()
+    item = {n for n, v in rows.items() if v.causality == "parameter"} | started
+    fixed = item | {n for n, v in rows.items() if v.causality == "input"}
     for name in [n for n in values if n not in fixed]:
         problems.add(
             f"`values` has '{name}', which is no parameter or input of {fmu.path.name}; it has"
             f" {quoted(sorted(fixed)) or 'none'}."
         )
-    wanted = _free(fmu, free, own, problems)
+    wanted = _free(fmu, free, item, problems)
     problems.raise_if_any()
     parameters = [
-        _parameter(n, fmu, rows[n], given, values, problems) for n, given in wanted.items()
+        _parameter(n, fmu, rows[n], arguments, values, problems) for n, arguments in wanted.items()
     ]
     problems.raise_if_any()
     states = [] if whole else [table[n] for n in fmu.states()]
@@ -145,12 +145,12 @@ def _free(
     fmu: Fmu, free: Free | None, numbers: Iterable[str], problems: Problems
 ) -> dict[str, tuple[float, float] | Parameter]:
     """Return the parameters to identify with their bounds: those given, else the FMU's."""
-    own = {n for n in numbers if fmu.elements[n].real}
-    limits = {n: fmu.bounds[fmu.elements[n].variable] for n in own}
-    bounded = {n for n in own if math.isfinite(math.hypot(*limits[n]))}
+    item = {n for n in numbers if fmu.elements[n].real}
+    limits = {n: fmu.bounds[fmu.elements[n].variable] for n in item}
+    bounded = {n for n in item if math.isfinite(math.hypot(*limits[n]))}
     if free is None:
         if not bounded:
-            every = {n: _start(fmu, n) for n in fmu.elements if n in own}
+            every = {n: _start(fmu, n) for n in fmu.elements if n in item}
             listed = ", ".join(f"{n} ({v:g})" for n, v in every.items()) or "none"
             name, v = next(iter(every.items()), ("k", 1.0))
             low, high = sorted((0.1 * v, 10.0 * v)) if v else (-1.0, 1.0)
@@ -160,13 +160,13 @@ def _free(
                 f" command line --free {name}={low:g}:{high:g}."
             )
         return {n: limits[n] for n in fmu.elements if n in bounded}
-    given = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
-    found: dict[str, tuple[float, float] | Parameter] = {}
-    for name, bounds in given.items():
-        if name not in own:
+    inputs = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
+    table: dict[str, tuple[float, float] | Parameter] = {}
+    for name, bounds in inputs.items():
+        if name not in item:
             problems.add(
                 f"`free` has '{name}', which is no real parameter of {fmu.path.name}; it has"
-                f" {quoted(sorted(own)) or 'none'}."
+                f" {quoted(sorted(item)) or 'none'}."
             )
         elif bounds is None and name not in bounded:
             problems.add(
@@ -174,21 +174,21 @@ def _free(
                 f" command line --free {name}=LOW:HIGH."
             )
         else:
-            found[name] = limits[name] if bounds is None else bounds
-    return found
+            table[name] = limits[name] if bounds is None else bounds
+    return table
 
 
 def _parameter(
     name: str,
     fmu: Fmu,
     variable: Any,
-    given: tuple[float, float] | Parameter,
+    parameter: tuple[float, float] | Parameter,
     values: Mapping[str, float],
     problems: Problems,
 ) -> Parameter:
-    if isinstance(given, Parameter):
-        return given
-    low, high = (float(b) for b in given)
+    if isinstance(parameter, Parameter):
+        return parameter
+    low, high = (float(b) for b in parameter)
     value = float(values.get(name, _start(fmu, name)))
     if low >= high:
         problems.add(f"'{name}' has the bounds [{low:g}, {high:g}]; give the lower one first.")
@@ -219,13 +219,13 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
 
 def _said(variable: Any, name: str) -> tuple[str, str]:
     """Return unit and description; "1" where this package does not know it or it is no SI unit."""
-    said = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
+    statement = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
     words = str(variable.description or name)
     try:
-        unit = parse_unit(said)
+        unit = parse_unit(statement)
     except InputError:
         return "1", words
-    return said if unit.ratio == 1 and not unit.offset else "1", words
+    return statement if unit.ratio == 1 and not unit.offset else "1", words
 
 
 def _start(fmu: Fmu, name: str) -> float:
@@ -290,10 +290,10 @@ def fmu_model(
             return _of_equations(fmu, file, digest, free, values or {}, name)
     chosen = _interface(fmu, None) if chosen is None else chosen
     read = read_variables(fmu, free, values or {}, whole=True)
-    s, own = read.selected, [p.name for p in read.parameters]
+    s, item = read.selected, [p.name for p in read.parameters]
     played = Played(
         str(file.resolve()), digest, chosen, s.inputs, s.outputs,
-        tuple(zip(own, s.parameters, strict=True)), s.fixed,
+        tuple(zip(item, s.parameters, strict=True)), s.fixed,
     )  # fmt: skip
     used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
     foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used, str(file.resolve()))
@@ -323,10 +323,10 @@ def _component(
     fmu: Fmu, read: Read, equations: Callable[[Symbols], Equations], foreign: Foreign,
     name: str | None, played: Played | None = None,
 ) -> Component:  # fmt: skip
-    own = _own(fmu, name)
+    item = _own(fmu, name)
     return Component(
-        name=own,
-        description=str(fmu.description.description or f"the FMU '{own}'"),
+        name=item,
+        description=str(fmu.description.description or f"the FMU '{item}'"),
         source=f"{foreign.fmu.file}, sha256 {foreign.fmu.sha256}",
         equations=equations,
         parameters=read.parameters,
@@ -431,15 +431,15 @@ def _definitions(imported: Imported, read: Read) -> dict[int, int]:
     rng, count = np.random.default_rng(_SEED), len(read.states)
     sizes = np.array(_sizes(read)[: count + len(read.inputs)])
     p = [q.value for q in read.parameters]
-    seen = []
+    items = []
     for _ in range(_POINTS):
         v = sizes * rng.uniform(0.1, 1.0, len(sizes))
         try:
-            seen.append((v, np.array(imported.function(0.0, v, p))[:, 0]))
+            items.append((v, np.array(imported.function(0.0, v, p))[:, 0]))
         except RuntimeError:  # where the equations are not defined
             continue
-    rows = range(count + len(read.outputs)) if seen else ()
-    found = {
-        k: next((j for j in range(count) if all(w[k] == v[j] for v, w in seen)), -1) for k in rows
+    rows = range(count + len(read.outputs)) if items else ()
+    table = {
+        k: next((j for j in range(count) if all(w[k] == v[j] for v, w in items)), -1) for k in rows
     }
-    return {k: j for k, j in found.items() if j >= 0}
+    return {k: j for k, j in table.items() if j >= 0}

@@ -152,14 +152,14 @@ class Imported:
         values = {n: float(p[k]) for k, n in enumerate(names)}
         old = self.instances.pop((slot, place), None)
         try:
-            found = self.initialised(values, old)
+            instance = self.initialised(values, old)
         except PsaError as error:
             self.refused = str(error)
             if old:
                 old.free()
             return None
-        self.instances[slot, place] = found
-        return int(found.fmi.component)
+        self.instances[slot, place] = instance
+        return int(instance.fmi.component)
 
 
 def digest_of(file: Path) -> str:
@@ -182,8 +182,8 @@ def opened(file: Path, digest: str) -> Fmu:
 @cache
 def imported_of(fmu: Fmu, digest: str, selected: Selected, sizes: tuple[float, ...]) -> Imported:
     """Return the function of an FMU; one for models with the same variables and fixed values."""
-    told = repr((digest, str(fmu.path), selected, sizes))
-    name = f"fmu_{hashlib.sha256(told.encode()).hexdigest()[:16]}"
+    output = repr((digest, str(fmu.path), selected, sizes))
+    name = f"fmu_{hashlib.sha256(output.encode()).hexdigest()[:16]}"
     return Imported(fmu, digest, name, selected, sizes)
 
 

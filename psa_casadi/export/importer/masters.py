@@ -137,7 +137,7 @@ def played_on_fmu(
         path = export_fmu(model, folder / "stack.fmu", name="stack")
         with Fmu(path) as fmu:
             inputs = Signals(("voltage",), time, voltage[:, None])
-            found = co_simulate(
+            values = co_simulate(
                 fmu, time, inputs, ["displacement"], tolerance=tolerance, values=start
             )
-    return np.asarray(found[:, 0])
+    return np.asarray(values[:, 0])

@@ -82,11 +82,11 @@ def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     at = _inputs(run, points)
     middle = _inputs(run, 0.5 * (points[:-1] + points[1:]))
     during = at[:-1] if rates and lines else middle
-    begins = {**run.values, **dict(zip(names, at[0].tolist(), strict=True))}
-    found = np.empty((len(points), len(run.outputs)))
+    table = {**run.values, **dict(zip(names, at[0].tolist(), strict=True))}
+    result = np.empty((len(points), len(run.outputs)))
     first = float(points[0])
-    with fmu.start(CO_SIMULATION, values=begins, start_time=first, **options) as instance:
-        found[0] = instance.get(run.outputs)
+    with fmu.start(CO_SIMULATION, values=table, start_time=first, **options) as instance:
+        result[0] = instance.get(run.outputs)
         for k, (begin, end) in enumerate(pairwise(points.tolist())):
             instance.set(dict(zip(names, during[k].tolist(), strict=True)))
             if rates and lines and names:
@@ -94,14 +94,14 @@ def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
                 instance.set_rates(dict(zip(names, slopes.tolist(), strict=True)))
             _step(instance, begin, end - begin)
             instance.set(dict(zip(names, at[k + 1].tolist(), strict=True)))
-            found[k + 1] = instance.get(run.outputs)
-    columns = [np.interp(run.t, points, column) for column in found.T]
+            result[k + 1] = instance.get(run.outputs)
+    columns = [np.interp(run.t, points, column) for column in result.T]
     return np.array(columns).reshape(len(run.outputs), len(run.t)).T
 
 
 def _step(instance: Instance, begin: float, size: float) -> None:
-    said = instance.fmi.doStep(begin, size)
-    if said is not None and bool(said[1]):
+    statement = instance.fmi.doStep(begin, size)
+    if statement is not None and bool(statement[1]):
         raise FmuError(f"the FMU ends the simulation at {begin + size:g} s")
 
 
@@ -114,8 +114,8 @@ def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
     co, gaps = fmu.description.coSimulation, np.diff(t)
     if not len(gaps):
         return t
-    said = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    most = float(said) if said else math.inf
+    statement = getattr(fmu.description.defaultExperiment, "stepSize", None)
+    most = float(statement) if statement else math.inf
     most = min(most, float(np.max(gaps))) / parts
     internal, middle = getattr(co, "fixedInternalStepSize", None), float(np.median(gaps))
     even = bool(np.ptp(gaps) <= _SAME * middle)
@@ -166,12 +166,12 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     """Integrate a new instance of model exchange over a run, with its events. Raises FmuError."""
     t = run.t.tolist()
     with fmu.open(MODEL_EXCHANGE, **options) as instance:
-        begins = dict(zip(run.inputs, run.u[0].tolist(), strict=True))
-        instance.setup(start_time=t[0], values={**run.values, **begins})
+        starts = dict(zip(run.inputs, run.u[0].tolist(), strict=True))
+        instance.setup(start_time=t[0], values={**run.values, **starts})
         event, fmi = instance.leave_event_mode(), instance.fmi
-        two, told = fmu.version == 2, fmu.description.modelExchange
-        finished = getattr(told, "completedIntegratorStepNotNeeded", None)
-        needed = bool(told.needsCompletedIntegratorStep) and not finished
+        two, output = fmu.version == 2, fmu.description.modelExchange
+        finished = getattr(output, "completedIntegratorStepNotNeeded", None)
+        needed = bool(output.needsCompletedIntegratorStep) and not finished
         inputs = _Inputs(instance, run)
         solver = _Solver(
             nx=sum(fmu.elements[n].variable in set(fmu.states()) for n in fmu.elements),
@@ -189,11 +189,13 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
                 happened, _, now = solver.step(now, stop)
                 fmi.setTime(now)
                 inputs.apply(now)
-                asked = [bool(q) for q in fmi.completedIntegratorStep()] if needed else [False] * 2
-                if asked[1]:
+                requested = (
+                    [bool(q) for q in fmi.completedIntegratorStep()] if needed else [False] * 2
+                )
+                if requested[1]:
                     raise FmuError(f"the FMU ends the simulation at {now:g} s")
                 jumps = run.hold == "zero" and now >= target - same
-                if happened or asked[0] or jumps or now >= event - same:
+                if happened or requested[0] or jumps or now >= event - same:
                     if jumps:
                         rows.append(instance.get(run.outputs))
                     instance.require("EnterEventMode")

@@ -84,9 +84,9 @@ class Played:
     def _of(
         self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str, parts: int
     ) -> Run:
-        given = {**dict(self.fixed), **{n: values[own] for own, n in self.parameters}}
-        own = self.file, self.digest, self.interface, self.inputs, self.outputs
-        return Run(*own, given, t, u, hold, parts)
+        table = {**dict(self.fixed), **{n: values[item] for item, n in self.parameters}}
+        item = self.file, self.digest, self.interface, self.inputs, self.outputs
+        return Run(*item, table, t, u, hold, parts)
 
     def _parts(self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str) -> int:
         """Return into how many parts a step of co-simulation is divided with these inputs.
@@ -119,14 +119,14 @@ class Played:
         States are those of effects. They begin as far from rest as `x0` is from the rest that
         `begun` finds without the FMU, whatever `s0` is.
         """
-        own = dict(values or model.values)
-        inner = inner_of(model).with_values(own)
-        asked = list(model.output_names if outputs is None else outputs)
+        item = dict(values or model.values)
+        inner = inner_of(model).with_values(item)
+        items = list(model.output_names if outputs is None else outputs)
         away, names = x0 - begun(model, t, u, {}).x, inner.output_names
         states = dict(zip(model.state_names, away.tolist(), strict=True))
-        count, given = len(unknowns), [_GIVEN + n for n in model.input_names]
+        count, inputs = len(unknowns), [_GIVEN + n for n in model.input_names]
 
-        def around(y: FloatArray, shown: Sequence[str], by: Sequence[str | int]) -> Steps:
+        def around(y: FloatArray, texts: Sequence[str], by: Sequence[str | int]) -> Steps:
             """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
             whole = np.hstack([u, y])
             begin = begun(inner, t, whole, states)
@@ -139,56 +139,56 @@ class Played:
             slopes = np.array(columns).reshape(len(by), len(x0)).T
             return run(
                 inner, t, whole, begin.x, rtol=rtol, hold=hold, unknowns=by, s0=slopes,
-                outputs=shown,
+                outputs=texts,
             )  # fmt: skip
 
         silent = np.zeros((len(t), len(self.outputs)))
-        before = around(silent, given, unknowns)
-        applied = before.y[:, [names.index(n) for n in given]]
+        before = around(silent, inputs, unknowns)
+        applied = before.y[:, [names.index(n) for n in inputs]]
         kept = hold if not _filtered(inner.structure) else "linear"
         moved = [
             k
             for k, q in enumerate(unknowns)
             if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
         ]
-        steps = {k: _step(inner, unknowns[k], own) for k in moved}
+        steps = {k: _step(inner, unknowns[k], item) for k in moved}
 
         def changed(k: int, side: int) -> tuple[Mapping[str, float], FloatArray]:
             """Return values and inputs with a step of an unknown to one side."""
             q, h = unknowns[k], side * steps[k]
-            new = {**own, q: own[q] + h} if isinstance(q, str) else own
+            new = {**item, q: item[q] + h} if isinstance(q, str) else item
             return new, applied + h * before.sensitivity[:, :, k]
 
-        parts = self._parts(own, u, t, kept)
+        parts = self._parts(item, u, t, kept)
         plain, *others = self.outputs_of(
-            [(own, applied), *(changed(k, 1) for k in moved)], t, kept, parts
+            [(item, applied), *(changed(k, 1) for k in moved)], t, kept, parts
         )
-        found = around(plain, asked, unknowns)
-        rows = [names.index(n) for n in asked]
+        result = around(plain, items, unknowns)
+        rows = [names.index(n) for n in items]
 
         def slope(k: int, side: int, y: FloatArray) -> FloatArray:
-            return (around(y, asked, ()).y[:, rows] - found.y[:, rows]) / (side * steps[k])
+            return (around(y, items, ()).y[:, rows] - result.y[:, rows]) / (side * steps[k])
 
         slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
         jumping = [k for k in moved if _jumps(slopes[k])]
         back = self.outputs_of([changed(k, -1) for k in jumping], t, kept, parts)
         for k, y in zip(jumping, back, strict=True):
             slopes[k] = _lesser(slopes[k], slope(k, -1, y))
-        sensitivity = found.sensitivity.copy()
+        sensitivity = result.sensitivity.copy()
         for k in moved:
             sensitivity[:, :, k] += slopes[k]
         every = [names.index(n) for n in model.output_names]
         return replace(
-            found, y=found.y[:, every], sensitivity=sensitivity.reshape(len(t), len(rows), count)
+            result, y=result.y[:, every], sensitivity=sensitivity.reshape(len(t), len(rows), count)
         )
 
 
 def _jumps(slope: FloatArray) -> bool:
     """Whether a difference (n, m) leads across jumps: samples that stand far above those beside."""
     size = np.abs(slope)
-    beside = np.maximum(size[:-2], size[2:])
+    others = np.maximum(size[:-2], size[2:])
     least = _SPIKE_SHARE * np.max(size, axis=0, initial=0.0)
-    return bool(np.any((size[1:-1] > _SPIKE * beside) & (size[1:-1] > least)))
+    return bool(np.any((size[1:-1] > _SPIKE * others) & (size[1:-1] > least)))
 
 
 def _lesser(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -225,9 +225,9 @@ class _InnerEquations:
     outputs: tuple[str, ...]
 
     def __call__(self, s: Symbols) -> Equations:
-        given: dict[str, Expression] = {_GIVEN + n: getattr(s, n) for n in self.inputs}
-        shown = {n: getattr(s, _PLAYED + n) for n in self.outputs}
-        return Equations(out={**shown, **given})
+        expressions: dict[str, Expression] = {_GIVEN + n: getattr(s, n) for n in self.inputs}
+        table = {n: getattr(s, _PLAYED + n) for n in self.outputs}
+        return Equations(out={**table, **expressions})
 
 
 def inner_of(model: Model) -> Model:
@@ -298,23 +298,23 @@ class _Runs:
 
     def of(self, runs: Iterable[Run]) -> list[FloatArray]:
         """Return the outputs of runs. Raises SimulationError."""
-        given = list(runs)
-        keys = {_key(r): r for r in given}
+        items = list(runs)
+        keys = {_key(r): r for r in items}
         with self._lock:
             new = {k: self._submitted(r) for k, r in keys.items() if k not in self._kept}
-            found: dict[str, FloatArray | str] = {k: self._kept[k] for k in keys if k not in new}
+            table: dict[str, FloatArray | str] = {k: self._kept[k] for k in keys if k not in new}
         try:
             for key, future in new.items():
-                found[key] = self._result(future, keys[key])
+                table[key] = self._result(future, keys[key])
         except KeyboardInterrupt:
             self.end()
             raise
         with self._lock:
             for key in new:
-                self._kept[key] = found[key]
+                self._kept[key] = table[key]
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
-        results = [found[_key(r)] for r in given]
+        results = [table[_key(r)] for r in items]
         for result in results:
             if isinstance(result, str):
                 raise SimulationError(f"The FMU could not be simulated: {result}")
@@ -354,18 +354,18 @@ def _waited(future: "Future[Any]") -> FloatArray | str:
     """Return what comes of a run, in numbers or words. Raises MachineError, KeyboardInterrupt."""
     while True:
         with suppress(TimeoutError):
-            found: FloatArray | str = future.result(timeout=_LOOK)
-            if isinstance(found, str):
-                return found
-            return found if np.isfinite(found).all() else "its outputs are not finite"
+            result: FloatArray | str = future.result(timeout=_LOOK)
+            if isinstance(result, str):
+                return result
+            return result if np.isfinite(result).all() else "its outputs are not finite"
         raise_if_stopped()
 
 
 def _key(of: Run) -> str:
-    told = repr(
+    output = repr(
         (of.file, of.digest, of.interface, of.inputs, of.outputs, of.values, of.hold, of.parts)
     )
-    content = hashlib.sha256(told.encode())
+    content = hashlib.sha256(output.encode())
     content.update(np.ascontiguousarray(of.t).tobytes())
     content.update(np.ascontiguousarray(of.u).tobytes())
     return content.hexdigest()

@@ -30,10 +30,10 @@ def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note,
 
     Raises InputError for a model that is of no FMU, and for another ending.
     """
-    target, own = Path(path), [c for c in model.components if c.foreign]
-    if not own:
+    target, item = Path(path), [c for c in model.components if c.foreign]
+    if not item:
         raise InputError(f"The model '{model.name}' is of no FMU; save it with psa.save_model.")
-    component = own[0]
+    component = item[0]
     values = fmu_values(model, component)
     if target.suffix.lower() == ".ssv":
         atomic_write(target, start_set(model, component))
@@ -51,15 +51,15 @@ def start_set(model: Model, component: Component) -> str:
 
     And what else was set in it.
     """
-    own = (p.name for p in component.parameters)
-    known = dict(zip(own, fmu_values(model, component), strict=True))
+    item = (p.name for p in component.parameters)
+    known = dict(zip(item, fmu_values(model, component), strict=True))
     rows = parameter_rows(model)
-    told = [(known[n], m, v, "" if u == "1" else u) for n, m, v, u in rows if n in known]
+    items = [(known[n], m, v, "" if u == "1" else u) for n, m, v, u in rows if n in known]
     fixed = component.foreign.fmu.values if component.foreign else {}
-    told += [(n, "as it was set", v, "") for n, v in fixed.items()]
+    items += [(n, "as it was set", v, "") for n, v in fixed.items()]
     with Archive(Path(component.foreign.place if component.foreign else "")) as archive:
-        kinds = {n: archive.elements[n].type for n, *_ in told if not archive.elements[n].real}
-    return set_text(component.name, told, kinds)
+        kinds = {n: archive.elements[n].type for n, *_ in items if not archive.elements[n].real}
+    return set_text(component.name, items, kinds)
 
 
 def fmu_values(model: Model, component: Component) -> dict[str, float]:
@@ -88,11 +88,11 @@ def _copy(place: Path, target: Path, values: Mapping[str, float]) -> None:
 
 def _starts(of: Archive, values: Mapping[str, float]) -> dict[str, str]:
     """Return the start of every variable of which an element has a value."""
-    found: dict[str, list[float]] = {}
+    table: dict[str, list[float]] = {}
     for name, value in values.items():
         e = of.elements[name]
-        found.setdefault(e.variable, list(e.starts))[e.place] = value
-    return {name: " ".join(map(repr, starts)) for name, starts in found.items()}
+        table.setdefault(e.variable, list(e.starts))[e.place] = value
+    return {name: " ".join(map(repr, starts)) for name, starts in table.items()}
 
 
 def _with_starts(content: bytes, starts: Mapping[str, str]) -> bytes:
@@ -115,5 +115,7 @@ def _kept_by(path: Path, values: Mapping[str, float]) -> tuple[Note, ...]:
             read = instance.get(list(values))
     except PsaError:
         return ()
-    own = [n for (n, v), r in zip(values.items(), read, strict=True) if abs(r - v) > _SAME * abs(v)]
-    return (note("starts_in_binary", names=tuple(own)),) if own else ()
+    items = [
+        n for (n, v), r in zip(values.items(), read, strict=True) if abs(r - v) > _SAME * abs(v)
+    ]
+    return (note("starts_in_binary", names=tuple(items)),) if items else ()

@@ -116,7 +116,7 @@ def class_text(
     s = model.structure
     equations = _equations(model, Identifiers(IDENTIFIERS if connectors else ()))
     names = equations.names
-    given = {n for c in connectors for n in CONNECTORS[c][1]}
+    inputs = {n for c in connectors for n in CONNECTORS[c][1]}
 
     def declared(its: Iterable[Input | Output], prefix: str) -> list[str]:
         return [_declaration(model, it, names[it.name], prefix) for it in its]
@@ -133,12 +133,12 @@ def class_text(
         gained="G" in model.parameter_names,
         drawing=drawing_of(model),
         declarations=[
-            *declared((i for i in s.inputs if i.name not in given), "input Real"),
+            *declared((i for i in s.inputs if i.name not in inputs), "input Real"),
             *declared(s.outputs, "Real" if connectors else "output Real"),
             *_declarations_of_components(model, names, fixed),
         ],
         hidden=[
-            *declared((i for i in s.inputs if i.name in given), "Real"),
+            *declared((i for i in s.inputs if i.name in inputs), "Real"),
             *(_variable(v, "Real") for v in hidden),
             *(_variable(v, "discrete Real") for v in equations.sampled_parts),
         ],
@@ -153,15 +153,15 @@ def _declarations_of_components(
     lines: list[str] = []
     states = {s.name: s for s in model.structure.states}
     for component in model.components:
-        own: list[tuple[Parameter | State, str]] = [
+        item: list[tuple[Parameter | State, str]] = [
             (p, "final parameter Real" if p.name in fixed else "parameter Real")
             for p in component.parameters
         ]
-        own += [(states[s.name], "Real") for s in component.states]
-        own += [(s, "discrete Real") for s in component.sampled]
+        item += [(states[s.name], "Real") for s in component.states]
+        item += [(s, "discrete Real") for s in component.sampled]
         lines += _section(
             f"{component.name}: {component.description}",
-            [_declaration(model, it, names[it.name], prefix) for it, prefix in own],
+            [_declaration(model, it, names[it.name], prefix) for it, prefix in item],
         )
     return lines
 
@@ -169,8 +169,8 @@ def _declarations_of_components(
 def _declaration(
     model: Model, it: Input | Output | Parameter | State, name: str, prefix: str
 ) -> str:
-    shown = string(unit_text(it.display_unit)) if it.display_unit else None
-    stated, value = {"unit": string(unit_text(it.unit)), "displayUnit": shown}, ""
+    displayed = string(unit_text(it.display_unit)) if it.display_unit else None
+    stated, value = {"unit": string(unit_text(it.unit)), "displayUnit": displayed}, ""
     if isinstance(it, Parameter):
         for end, bound in zip(("min", "max"), it.bounds, strict=True):
             if not math.isinf(bound):
@@ -323,9 +323,9 @@ def _outputs(structure: Structure) -> Iterator[tuple[str, Expression]]:
     for output in s.outputs:
         expression = s.out[output.name]
         if output.name == "velocity" and "displacement" in s.balances:
-            shown = _written_out(s.balances["displacement"], s, list(s.balances))
+            displayed = _written_out(s.balances["displacement"], s, list(s.balances))
             rates = ca.vertcat(*[ca.SX.sym(f"der({q.name})") for q in s.states])
-            expression = ca.jtimes(shown, s.x, rates) + ca.jacobian(shown, s.time)
+            expression = ca.jtimes(displayed, s.x, rates) + ca.jacobian(displayed, s.time)
         if not (output.name in s.symbols and is_symbol(expression, output.name)):
             yield output.name, expression
 
@@ -338,11 +338,11 @@ def is_symbol(expression: Expression, name: str) -> bool:
 
 def _written_out(expression: Expression, structure: Structure, names: Sequence[str]) -> ca.SX:
     """Return an expression with these balances in the place of their symbols."""
-    found = ca.SX(expression)
+    sx = ca.SX(expression)
     symbols = [structure.symbols[n] for n in names]
-    while any(ca.depends_on(found, s) for s in symbols):
-        found = ca.substitute([found], symbols, [structure.balances[n] for n in names])[0]
-    return found
+    while any(ca.depends_on(sx, s) for s in symbols):
+        sx = ca.substitute([sx], symbols, [structure.balances[n] for n in names])[0]
+    return sx
 
 
 def _before(name: str) -> str:
@@ -409,13 +409,13 @@ def _name_parts(
 
 def _known_parts(symbols: Symbols) -> list[tuple[str, str, str, Expression]]:
     """Return name, unit, meaning and expression of the parts whose symbols the model has."""
-    found = []
+    items = []
     for name, (unit, meaning, made) in PARTS.items():
         try:
-            found.append((name, unit, meaning, made(symbols)))
+            items.append((name, unit, meaning, made(symbols)))
         except AttributeError:
             continue
-    return found
+    return items
 
 
 def _owners(graph: Graph, structure: Structure, later: Mapping[str, Expression]) -> dict[int, str]:
@@ -445,10 +445,10 @@ def _terms(
     terms: list[tuple[str, str]] = []
     for name, term in reversed(contributions[1:]):
         node = graph.nodes[number]
-        (own,) = graph.read([term])
-        if node.operation == "add" and node.arguments[1] == own:
+        (item,) = graph.read([term])
+        if node.operation == "add" and node.arguments[1] == item:
             sign = "+ "
-        elif node.operation == "sub" and graph.add("neg", node.arguments[1]) == own:
+        elif node.operation == "sub" and graph.add("neg", node.arguments[1]) == item:
             sign = "- "
         else:
             return ((printer.definition(number), ""), *terms)

@@ -132,8 +132,8 @@ def unit_text(unit: str) -> str:
 
 def modifier(attributes: Mapping[str, str | None]) -> str:
     """Return the attributes that have a value in parentheses, or nothing if none has."""
-    given = [f"{name}={value}" for name, value in attributes.items() if value is not None]
-    return f"({', '.join(given)})" if given else ""
+    items = [f"{name}={value}" for name, value in attributes.items() if value is not None]
+    return f"({', '.join(items)})" if items else ""
 
 
 # how tightly an operator binds
@@ -225,9 +225,9 @@ class Printer:
             return form.format(*(_enclosed(self._number(a), _SUM) for a in it.arguments)), binding
         if it.operation == "not":
             return f"not {_enclosed(self._condition(it.arguments[0]), _RELATION)}", _NOT
-        own = _CONNECTED[it.operation]
-        sides = (_enclosed(self._condition(a), own + 1) for a in it.arguments)
-        return f" {it.operation} ".join(sides), own
+        item = _CONNECTED[it.operation]
+        sides = (_enclosed(self._condition(a), item + 1) for a in it.arguments)
+        return f" {it.operation} ".join(sides), item
 
 
 def _enclosed(written: Text, at_least: int) -> str:

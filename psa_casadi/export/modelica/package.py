@@ -210,8 +210,8 @@ def documentation(model: Model, **more: object) -> str:
     That is a table of `components`; the `wiring` of pins and flange; the reaction in a `cascade`;
     of the package whether the states are at `rests`, and whether some are `sampled`.
     """
-    said = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
-    about = [t for t in (describe(model), said, f"Written by {generation_tool()}.") if t]
+    statement = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
+    about = [t for t in (describe(model), statement, f"Written by {generation_tool()}.") if t]
     every = dict.fromkeys(("components", "wiring", "cascade", "rests", "sampled")) | more
     text = filled("modelica.html", about=map(_plain, about), values=model.values, **every)
     return f"Documentation(info={string(text.rstrip())})"
@@ -219,10 +219,10 @@ def documentation(model: Model, **more: object) -> str:
 
 def components_of(model: Model) -> list[list[str]]:
     """Return the components: what they are, their equations, their sources."""
-    told = (
+    output = (
         (c.name, c.description, c.equation_text, c.source.rstrip(".")) for c in model.components
     )
-    return [[_plain(cell) for cell in row] for row in told]
+    return [[_plain(cell) for cell in row] for row in output]
 
 
 def _plain(text: str) -> Markup:

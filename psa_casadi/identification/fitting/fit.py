@@ -82,22 +82,22 @@ def beginnings(
     the model misses, of the channels without factors. Raises PsaError where a record cannot be
     simulated.
     """
-    found = theta.copy()
-    own = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    paths = theta.copy()
+    item = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
     for k, experiment in enumerate(experiments):
         if not experiment.held_out_whole or not experiment.known.any():
             continue
         first, last = unknowns.first(k), unknowns.first(k + 1)
-        found[first:last] = 0.0
-        told = _told(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
-        shared = {c: told[c] for c in told if unknowns.started[k][c - first] not in own}
-        found[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        paths[first:last] = 0.0
+        output = _told(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
+        shared = {c: output[c] for c in output if unknowns.started[k][c - first] not in item}
+        paths[list(shared)] = [float(np.mean(v)) for v in shared.values()]
         sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
-        for c in sizes.keys() & told.keys():
-            size = float(np.sqrt(np.mean(np.square(told[c]))))
+        for c in sizes.keys() & output.keys():
+            size = float(np.sqrt(np.mean(np.square(output[c]))))
             sizes[c] = min(sizes[c], max(size, _LEAST))
-        found[list(sizes)] = _sought(model, unknowns, found, experiment, k, levels, sizes, way)
-    return found
+        paths[list(sizes)] = _sought(model, unknowns, paths, experiment, k, levels, sizes, way)
+    return paths
 
 
 def _told(
@@ -109,21 +109,21 @@ def _told(
     """
     first = unknowns.first(k)
     size = max(float(np.ptp(e.record.voltage)) for e in experiments)
-    begins = unknowns.first_voltage
-    alike = [
+    starts = unknowns.first_voltage
+    items = [
         j
         for j, other in enumerate(experiments)
-        if not other.held_out_whole and abs(begins[j] - begins[k]) <= _SAME * size
+        if not other.held_out_whole and abs(starts[j] - starts[k]) <= _SAME * size
     ]
-    found = {
+    table = {
         first + place: [
             float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
-            for j in alike
+            for j in items
             if name in unknowns.started[j]
         ]
         for place, name in enumerate(unknowns.started[k])
     }
-    return {c: values for c, values in found.items() if values}
+    return {c: values for c, values in table.items() if values}
 
 
 def _sought(
@@ -144,9 +144,9 @@ def _sought(
     at = [experiment.at(j, experiment.known) for j in plain]
     weights = [levels[i] * experiment.share(j) for i, j in enumerate(plain)]
 
-    def evaluate(own: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    def evaluate(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         there = theta.copy()
-        there[columns] = own
+        there[columns] = values
         try:
             run = trace_record(
                 model, experiment.record, unknowns.start(there, k), (),
@@ -155,24 +155,24 @@ def _sought(
         except PsaError:
             return None
         by_start, by_offset = unknowns.place_slopes(there, k)
-        missed, slopes = [], []
+        misfit, slopes = [], []
         for i, (j, known, weight) in enumerate(zip(plain, at, weights, strict=True)):
             offset, moves = (unknowns.offset(there, k), by_offset) if j == 0 else (0.0, 0.0)
-            shown = run.y[known[:stop], i] + offset
-            missed.append((shown - experiment.measured(j)[known]) / weight)
+            displayed = run.y[known[:stop], i] + offset
+            misfit.append((displayed - experiment.measured(j)[known]) / weight)
             slopes.append(
                 (run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight
             )
-        return np.concatenate([*missed, own * prior]), np.vstack([*slopes, np.diag(prior)])
+        return np.concatenate([*misfit, values * prior]), np.vstack([*slopes, np.diag(prior)])
 
     free = np.full(len(columns), np.inf)
-    found = minimise(  # the last coordinate is the offset, exactly linear
+    minimum = minimise(  # the last coordinate is the offset, exactly linear
         evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
         evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
     )  # fmt: skip
-    if found is None:
+    if minimum is None:
         raise PsaError("A held-out record cannot be simulated from where the others begin.")
-    return found.theta
+    return minimum.theta
 
 
 #: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
@@ -220,7 +220,7 @@ def accurate_minimum(
     for way in ways:
         evaluate = Objective(model, experiments, unknowns, sigma, way)
         try:
-            found = minimise(
+            result = minimise(
                 evaluate,
                 theta,
                 unknowns.bounds(),
@@ -238,24 +238,24 @@ def accurate_minimum(
             minimum, rougher = before
             ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
             return ended, rougher, []
-        if found is None:
+        if result is None:
             raise SimulationError(
                 "The model cannot be simulated at the start of the fit; start from other values."
                 f" {evaluate.refused}".rstrip()
             )
-        minimum, theta = found, found.theta
+        minimum, theta = result, result.theta
         before = minimum, way
-        spent += found.evaluations
+        spent += result.evaluations
         if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
             current_work().stop()
             return replace(minimum, evaluations=spent), way, []
         if minimum.cost > goal:  # of no use, however accurate
             return replace(minimum, evaluations=spent), way, []
-        told = simulated(model, experiments, unknowns, theta, way=way)
-        pairs_of = zip(told, allowed, strict=True)
-        if not any(e > a for t, own in pairs_of for e, a in zip(t.errors, own, strict=False)):
+        output = simulated(model, experiments, unknowns, theta, way=way)
+        pairs_of = zip(output, allowed, strict=True)
+        if not any(e > a for t, item in pairs_of for e, a in zip(t.errors, item, strict=False)):
             break
-    return replace(minimum, evaluations=spent), way, told
+    return replace(minimum, evaluations=spent), way, output
 
 
 def _readings(e: Experiment, channel: int) -> FloatArray:
@@ -291,14 +291,14 @@ class Objective:
         except PsaError as error:
             self.refused = str(error)
             return None
-        beside = further_of(self._of[1], parts)
+        furthers = further_of(self._of[1], parts)
         used, samples = self._used, len(self._target)
         y = np.concatenate([p.displacement[u] for p, u in zip(parts, used, strict=True)])
         with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is left
-            more = [b.jacobian / b.level for b in beside]
-            given = (-b.residuals / b.level for b in beside)
+            more = [b.jacobian / b.level for b in furthers]
+            inputs = (-b.residuals / b.level for b in furthers)
             residual = np.concatenate(
-                [(y - self._target) * self._share, *given, theta * self._prior]
+                [(y - self._target) * self._share, *inputs, theta * self._prior]
             )
             jacobian = np.empty((len(residual), len(theta)))
             first = 0
@@ -435,10 +435,10 @@ class Fit:
     def shown(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict all channels over whole records (n, channels); nan where a record has none."""
         parts = self.predictions(experiments, differentiated=False, further=True)
-        beside = [predicted_further(experiments, parts, f) for f in self.further]
+        items = [predicted_further(experiments, parts, f) for f in self.further]
         return [
             np.column_stack(
-                [p.displacement, *(own.get(k, np.full(e.record.n, np.nan)) for own in beside)]
+                [p.displacement, *(item.get(k, np.full(e.record.n, np.nan)) for item in items)]
             )
             for k, (e, p) in enumerate(zip(experiments, parts, strict=True))
         ]
@@ -451,16 +451,16 @@ class Fit:
             self.model, whole, self.unknowns, theta,
             way=self.way, everything=True, differentiated=False, further=True,
         )  # fmt: skip
-        found = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
+        items = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
         for channel in self.channels:
             k = names.index(channel.channel.outputs[0])
             if channel.number == 0:
-                for y, p in zip(found, parts, strict=True):
+                for y, p in zip(items, parts, strict=True):
                     y[:, k] = p.displacement
             elif not channel.channel.factors:
                 for r, y in predicted_further(experiments, parts, channel).items():
-                    found[r][:, k] = y
-        return found
+                    items[r][:, k] = y
+        return items
 
     def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
         """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
@@ -471,13 +471,13 @@ class Fit:
     @cached_property
     def channels(self) -> tuple[Further, ...]:
         """The fits of all channels, the first one foremost."""
-        told = tuple(k for k, n in enumerate(self.lengths) if n)
-        level = self.sigma[told[0] if told else 0]
+        output = tuple(k for k, n in enumerate(self.lengths) if n)
+        level = self.sigma[output[0] if output else 0]
         first = Further(
             channel=self.channel, number=0, level=level, spread=self.spread,
             residuals=self.residuals, jacobian=self.jacobian,
             basis=np.zeros((len(self.residuals), 0)), factors=np.ones(1),
-            lengths=tuple(self.lengths[k] for k in told), records=told,
+            lengths=tuple(self.lengths[k] for k in output), records=output,
         )  # fmt: skip
         return (first, *self.further)
 
@@ -542,10 +542,10 @@ def fit(
     theta[: len(free)] = unknowns.coordinates(placed.values)
     for r, e in enumerate(experiments):
         if e.used.any():  # the offset's coordinate is linear: `minimise` puts it where it is best
-            shown = _readings(e, 0) if e.channels[0].offset else np.zeros(1)
-            offset = float(np.mean(shown)) if shown.size else 0.0
+            displayed = _readings(e, 0) if e.channels[0].offset else np.zeros(1)
+            offset = float(np.mean(displayed)) if displayed.size else 0.0
             unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
-    minimum, way, told = accurate_minimum(
+    minimum, way, output = accurate_minimum(
         model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
         rtol=rtol, goal=goal, radius=radius, patient=patient,
     )  # fmt: skip
@@ -554,9 +554,9 @@ def fit(
     if experiments[0].further:
         parts = predict(model, experiments, unknowns, minimum.theta, way=way, further=True)
         further = further_of(experiments, parts)
-    found, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
+    result, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
-        model=found,
+        model=result,
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -567,7 +567,7 @@ def fit(
         interrupted=minimum.interrupted,
         evaluations=minimum.evaluations,
         way=way,
-        simulated=tuple(told),
+        simulated=tuple(output),
         radius=minimum.radius,
         further=further,
         channel=experiments[0].channels[0],

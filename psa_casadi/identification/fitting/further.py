@@ -100,7 +100,7 @@ def _fitted(
     """Return the fit of one channel; offsets and factors are projected out where it is free."""
     channel = experiments[0].channels[number]
     at = {k: e.at(number) for k, e in enumerate(experiments)}
-    records = tuple(k for k, own in at.items() if own.any())
+    records = tuple(k for k, item in at.items() if item.any())
     shares = [experiments[k].share(number) for k in records]
     lengths = tuple(int(np.count_nonzero(at[k])) for k in records)
     target = np.concatenate(
@@ -130,7 +130,7 @@ def _fitted(
         spread = float(np.sqrt(np.mean(target**2)))
     else:
         left, spread = target - values[:, 0], span_of(experiments, number)
-    moved = sum(f * own for f, own in zip(factors, slopes, strict=True))
+    moved = sum(f * item for f, item in zip(factors, slopes, strict=True))
     moved = moved - basis @ (basis.T @ moved)
     return Further(
         channel=channel, number=number, level=channel.level, spread=spread, residuals=left,
@@ -144,17 +144,17 @@ def span_of(experiments: Sequence[Experiment], number: int) -> float:
     return float(np.ptp(np.concatenate(parts))) if any(p.size for p in parts) else 0.0
 
 
-def scaled(model: Model, found: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:
+def scaled(model: Model, furthers: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:
     """Return a model whose sensors have the scales that were found, and the factors beside it."""
-    values, beside = {}, []
-    for each in found:
+    values, others = {}, []
+    for each in furthers:
         name, factors = each.channel.scale, each.factors
         if name is not None and factors[0] != 0.0:
             low, high = model.parameter(name).bounds
             values[name] = float(np.clip(factors[0] * model.values[name], low, high))
             factors = factors * model.values[name] / values[name]
-        beside.append(replace(each, factors=factors))
-    return model.with_values(values), tuple(beside)
+        others.append(replace(each, factors=factors))
+    return model.with_values(values), tuple(others)
 
 
 def predicted_further(
@@ -165,7 +165,7 @@ def predicted_further(
     Factors are those of the fit, offsets those of the known samples. The predictions are those of
     whole records, with the further channels' outputs.
     """
-    found = {}
+    table = {}
     for k, (e, p) in enumerate(zip(experiments, predictions, strict=True)):
         known = e.at(fitted.number, e.known)
         if not known.any():
@@ -174,8 +174,8 @@ def predicted_further(
         total = sum((f * p.further[name][0] for f, name in rows), np.zeros(e.record.n))
         if fitted.channel.offset:
             total = total + np.mean((e.measured(fitted.number) - total)[known])
-        found[k] = total
-    return found
+        table[k] = total
+    return table
 
 
 def _centred(values: FloatArray, lengths: Sequence[int]) -> FloatArray:

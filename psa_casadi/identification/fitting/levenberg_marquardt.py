@@ -94,14 +94,14 @@ def minimise(
             converged = True
             break
         try:
-            found = _measurable(evaluate(trial))
+            result = _measurable(evaluate(trial))
         except KeyboardInterrupt:
             interrupted = True
             break
         count += 1
         new = np.inf
-        if found is not None:
-            trial, *at_trial = _at_best(trial, found, columns)
+        if result is not None:
+            trial, *at_trial = _at_best(trial, result, columns)
             new = float(at_trial[0] @ at_trial[0])
         ratio = (cost - new) / predicted
         if ratio < 0.25:
@@ -140,22 +140,22 @@ def _decrease(gradient: FloatArray, normal: FloatArray, move: FloatArray) -> flo
 
 
 def _measurable(
-    found: tuple[FloatArray, FloatArray] | None,
+    result: tuple[FloatArray, FloatArray] | None,
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return residual and Jacobian where |J|^2 |r|^2 is finite, else None: the model diverged."""
-    if found is None:
+    if result is None:
         return None
-    residual, jacobian = found
+    residual, jacobian = result
     with np.errstate(over="ignore", invalid="ignore"):
         size = float(np.vdot(residual, residual)) * max(1.0, float(np.vdot(jacobian, jacobian)))
-    return found if np.isfinite(size) else None
+    return result if np.isfinite(size) else None
 
 
 def _at_best(
-    theta: FloatArray, found: tuple[FloatArray, FloatArray], columns: list[int]
+    theta: FloatArray, result: tuple[FloatArray, FloatArray], columns: list[int]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return theta, residual and Jacobian where the residual's linear coordinates are best."""
-    residual, jacobian = found
+    residual, jacobian = result
     if not columns:
         return theta, residual, jacobian
     slopes = jacobian[:, columns]

@@ -64,9 +64,9 @@ def predict_record(
     them, in the states' units. Time counts from the record's first sample. `rtol` is the tolerance
     of a step.
     """
-    found = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
-    count, slopes = len(wanted), found.sensitivity[:, 0]
-    return found.y[:, 0], slopes[:, :count], slopes[:, count:]
+    traced = trace_record(model, record, start, wanted, stop=stop, way=Way(rtol, rtol))
+    count, slopes = len(wanted), traced.sensitivity[:, 0]
+    return traced.y[:, 0], slopes[:, :count], slopes[:, count:]
 
 
 def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
@@ -161,7 +161,7 @@ def traced_by_theta(
     """
     current = model.with_values(unknowns.values(theta))
     start = unknowns.start(theta, index)
-    found = trace_record(
+    traced = trace_record(
         current, record, start, unknowns.names, stop=stop, way=way, outputs=outputs
     )
     count = len(unknowns.names)
@@ -170,9 +170,9 @@ def traced_by_theta(
     by_theta[:count, :count] = slopes
     with np.errstate(all="ignore"):  # what is not finite is seen by the fit
         flat = (
-            found.sensitivity.reshape(-1, len(by_theta)) @ by_theta
+            traced.sensitivity.reshape(-1, len(by_theta)) @ by_theta
         )  # one product for all samples
-    return Traced(found.y, flat.reshape(*found.y.shape, unknowns.size), found.way)
+    return Traced(traced.y, flat.reshape(*traced.y.shape, unknowns.size), traced.way)
 
 
 def outputs_of(channels: Sequence[Channel]) -> tuple[str, ...]:
@@ -207,19 +207,19 @@ def predict(
             none = np.zeros(0), np.zeros((0, unknowns.size))
             return Prediction(*none, "", dict.fromkeys(outputs, none))
         if not differentiated:
-            found = trace_record(
+            traced = trace_record(
                 current, record, start, (), stop=stop, way=way, by_start=False, outputs=outputs
             )
         else:
-            found = traced_by_theta(
+            traced = traced_by_theta(
                 model, record, unknowns, theta, index,
                 stop=stop, way=way, slopes=slopes, outputs=outputs,
             )  # fmt: skip
-        shown = {n: (found.y[:, k], found.sensitivity[:, k]) for k, n in enumerate(outputs)}
-        x, jacobian = shown[outputs[0]]
+        table = {n: (traced.y[:, k], traced.sensitivity[:, k]) for k, n in enumerate(outputs)}
+        x, jacobian = table[outputs[0]]
         if differentiated:
             jacobian = jacobian + unknowns.place_slopes(theta, index)[1]
-        return Prediction(x + unknowns.offset(theta, index), jacobian, found.way, shown)
+        return Prediction(x + unknowns.offset(theta, index), jacobian, traced.way, table)
 
     return side_by_side(one, range(len(experiments)))
 
@@ -267,8 +267,8 @@ def simulated(
         gap, at = rough.y - finer.y, [e.at(k)[: e.stop] for k in plain]
         same = rough.way == finer.way
         errors = [
-            float(np.sqrt(np.mean(g[own] ** 2))) if own.any() else 0.0
-            for g, own in zip(gap.T, at, strict=True)
+            float(np.sqrt(np.mean(g[item] ** 2))) if item.any() else 0.0
+            for g, item in zip(gap.T, at, strict=True)
         ]
         return Simulated(rough.way, tuple(errors) if same else (float("inf"),) * len(plain))
 

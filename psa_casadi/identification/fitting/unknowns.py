@@ -154,10 +154,10 @@ class Unknowns:
         """Return the deviations of one record's initial state, in the states' units."""
         first, names = self.first(record), self.started[record]
         deviations = theta[first : first + len(names)] * self.start_scale[record]
-        found = dict(zip(names, deviations.tolist(), strict=True))
+        values = dict(zip(names, deviations.tolist(), strict=True))
         if self._carries(record):
-            found[_CARRIED] *= self._amplitude(theta) / self._a_ref
-        return found
+            values[_CARRIED] *= self._amplitude(theta) / self._a_ref
+        return values
 
     def place(
         self, theta: FloatArray, record: int, states: Mapping[str, float], offset: float
@@ -167,12 +167,12 @@ class Unknowns:
         The parameters' coordinates must stand in theta.
         """
         first, last = self.first(record), self.first(record + 1) - 1
-        found = {n: states.get(n, 0.0) for n in self.started[record]}
+        table = {n: states.get(n, 0.0) for n in self.started[record]}
         if self._carries(record):
             a = self._amplitude(theta)
-            offset += self.compliance * (found[_CARRIED] - a * self.first_voltage[record])
-            found[_CARRIED] *= self._a_ref / a
-        theta[first:last] = np.array(list(found.values())) / self.start_scale[record]
+            offset += self.compliance * (table[_CARRIED] - a * self.first_voltage[record])
+            table[_CARRIED] *= self._a_ref / a
+        theta[first:last] = np.array(list(table.values())) / self.start_scale[record]
         theta[last] = offset / self.offset_scale if self.offset_scale else 0.0
 
     def place_slopes(self, theta: FloatArray, record: int) -> tuple[FloatArray, FloatArray]:
@@ -250,10 +250,10 @@ def unknowns_of(
     record starts.
     """
     memories = dict(zip(memory_sizes(model).items(), memory_priors(model), strict=True))
-    own = {name: (size, prior) for (name, size), prior in memories.items()}
-    starts = [own | {n: (size, MOTION_PRIOR) for n, size in m.items()} for m in motions]
-    found = coordinates_of(model, free, starts, offset_scale, np.inf)
-    values, prior, log = model.values, found.prior, found.log
+    table = {name: (size, prior) for (name, size), prior in memories.items()}
+    starts = [table | {n: (size, MOTION_PRIOR) for n, size in m.items()} for m in motions]
+    unknowns = coordinates_of(model, free, starts, offset_scale, np.inf)
+    values, prior, log = model.values, unknowns.prior, unknowns.log
     prior[[k for k, n in enumerate(free) if n in _LAGS]] = LAG_PRIOR
     loop = None
     slope = values.get("k_L", 0.0) + values.get("A", 0.0)
@@ -262,7 +262,10 @@ def unknowns_of(
         log[list(loop)] = False
         prior[list(loop)] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
     return replace(
-        found, first_voltage=tuple(first_voltage), compliance=static_compliance(values), loop=loop
+        unknowns,
+        first_voltage=tuple(first_voltage),
+        compliance=static_compliance(values),
+        loop=loop,
     )
 
 
@@ -280,7 +283,7 @@ def coordinates_of(
     values: Mapping[str, float] = model.values
     parameters = [model.parameter(n) for n in free]
     log = np.array([p.log and values[p.name] > 0 for p in parameters], dtype=bool)
-    own = [np.array([prior for _, prior in s.values()] + [offset_prior]) for s in starts]
+    items = [np.array([prior for _, prior in s.values()] + [offset_prior]) for s in starts]
     return Unknowns(
         names=tuple(free),
         started=tuple(tuple(s) for s in starts),
@@ -293,7 +296,7 @@ def coordinates_of(
         first_voltage=(),
         compliance=0.0,
         offset_scale=offset_scale,
-        prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *own]),
+        prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *items]),
     )
 
 

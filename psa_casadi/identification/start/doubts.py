@@ -62,17 +62,17 @@ def refuse_still(records: Sequence[Record]) -> None:
         raise InputError([_TWO.format(*max(values, key=np.ptp))])
 
 
-def refuse_few(given: Sequence[Record], kept: Sequence[Record], said: Sequence[str]) -> None:
-    """Raise InputError where masking left hardly a reading; `said` is what it was done for."""
-    before, after = (sum(int(r.mask.sum()) for r in records) for records in (given, kept))
+def refuse_few(inputs: Sequence[Record], kept: Sequence[Record], texts: Sequence[str]) -> None:
+    """Raise InputError where masking left hardly a reading; `texts` is what it was done for."""
+    before, after = (sum(int(r.mask.sum()) for r in records) for records in (inputs, kept))
     if after < min(before, FEWEST_SAMPLES):
-        raise InputError([*said, _FEW.format(after, before, FEWEST_SAMPLES)])
-    found = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
-    others = after - sum(int(counts.max()) for _, counts in found)
+        raise InputError([*texts, _FEW.format(after, before, FEWEST_SAMPLES)])
+    items = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
+    others = after - sum(int(counts.max()) for _, counts in items)
     if others < min(after, FEWEST_SAMPLES):
-        values, counts = max(found, key=lambda f: int(f[1].max()))  # the reading that is there most
+        values, counts = max(items, key=lambda f: int(f[1].max()))  # the reading that is there most
         usual = float(values[np.argmax(counts)])
-        raise InputError([*said, _HARDLY.format(others, usual, FEWEST_SAMPLES)])
+        raise InputError([*texts, _HARDLY.format(others, usual, FEWEST_SAMPLES)])
 
 
 #: The largest mean speed of a stack's end [m/s]. A bar of length L has its first resonance at
@@ -98,9 +98,9 @@ _UNITS = {3: ("s", "ms"), 6: ("s", "us"), 9: ("s", "ns"),
 
 def refuse_other_time(records: Sequence[Record]) -> None:
     """Raise InputError where a stack would move faster than sound lets it, or never but creep."""
-    said = _faster(records, FASTEST)
-    if said:
-        raise InputError(said)
+    text = _faster(records, FASTEST)
+    if text:
+        raise InputError(text)
     fastest = max((_paces(r)[1] for r in records if np.ptp(r.voltage) > 0.0), default=1.0)
     if fastest < 1.0 / SLOWEST:
         raise InputError(
@@ -228,7 +228,7 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
     """
     for record in records:
         y, v = _readings(record)
-        if 2 * y.size < record.n or abs(own := _correlation(y, v)) > _FOLLOWS:
+        if 2 * y.size < record.n or abs(item := _correlation(y, v)) > _FOLLOWS:
             continue
         step = np.diff(record.time[record.mask])
         rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
@@ -236,15 +236,15 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
         both = np.column_stack([np.cumsum(0.5 * (y[1:] + y[:-1]) * step), v[1:]])
         summed, moved = (both - line @ np.linalg.lstsq(line, both, rcond=None)[0]).T
         integral = _correlation(summed, moved)
-        for found, is_it, holds in (
+        for result, is_it, holds in (
             (rate, "rate of", "an integral of"), (integral, "integral of", "the rate of"),
         ):  # fmt: skip
-            if abs(found) > _FOLLOWS:
-                return _OTHER.format(record.name, is_it, found, own, holds)
+            if abs(result) > _FOLLOWS:
+                return _OTHER.format(record.name, is_it, result, item, holds)
         turns = np.quantile(v, _TURNS)
-        found, at = max((abs(_correlation(np.where(v < u, -y, y), v)), u) for u in turns)
-        if found > _FOLLOWS:
-            return _TURNED.format(record.name, at, found, own)
+        result, at = max((abs(_correlation(np.where(v < u, -y, y), v)), u) for u in turns)
+        if result > _FOLLOWS:
+            return _TURNED.format(record.name, at, result, item)
     return ""
 
 
@@ -307,20 +307,20 @@ def refuse_unusable(records: Sequence[Record]) -> None:
     stroke = max(r.range_m for r in records)
     counts = any(r.displacement_unit == "counts" for r in records)
     low, high = _USABLE_SPANS
-    said = stray(records)
+    texts = stray(records)
     if not low <= max(span, top) <= high or span < 1e-9 * top or span < low:
         other = _suggestion(stroke, span) if top < _OFFSET * span else ""
         about = _HIGH.format(top, span) if top > high else _LOW.format(span)
-        raise InputError(said or [f"{about}{other}."])
+        raise InputError(texts or [f"{about}{other}."])
     low, high = _USABLE_STROKES
     if not counts and not low <= stroke <= high:
         side = "more" if stroke > high else "less"
-        raise InputError(said or [_STRANGE.format(stroke, side, _suggestion(stroke, span))])
+        raise InputError(texts or [_STRANGE.format(stroke, side, _suggestion(stroke, span))])
 
 
 def stray(records: Sequence[Record]) -> list[str]:
     """Name the few samples of a record that lie far from all others, in voltage or displacement."""
-    said = []
+    items = []
     for r in records:
         columns = [("voltage", "V", r.voltage), ("displacement", "m", measured(r))]
         for name, unit, column in columns:
@@ -329,12 +329,12 @@ def stray(records: Sequence[Record]) -> list[str]:
                 continue
             rest = np.delete(column, far)
             where = ", ".join(f"{column[k]:.3g} {unit} at {r.time[k]:.6g} s" for k in far)
-            said.append(
+            items.append(
                 f"Record '{r.name}': the {name} is {where}, and all others lie within"
                 f" {np.nanmin(rest):.3g} to {np.nanmax(rest):.3g} {unit}: correct or remove"
                 f" {'this sample' if far.size == 1 else 'these samples'}."
             )
-    return said
+    return items
 
 
 def _far(column: FloatArray) -> NDArray[np.intp]:
@@ -378,8 +378,8 @@ def doubtful_unit(records: Sequence[Record]) -> str:
         return ""
     side = "more" if slope > high else "less"
     stroke, span = (
-        max(float(of) for of in found)
-        for found in ((r.range_m for r in records), (np.ptp(r.voltage) for r in records))
+        max(float(of) for of in result)
+        for result in ((r.range_m for r in records), (np.ptp(r.voltage) for r in records))
     )
     return (
         f"The displacement changes by {slope:.1e} m per volt, {side} than piezoelectric stacks do"
@@ -403,11 +403,11 @@ def doubtful_voltage(records: Sequence[Record]) -> str:
 
 def doubtful_sign(records: Sequence[Record]) -> str:
     """Say that the displacement falls while the voltage rises; "" where it does not."""
-    found = correlation(records)
-    if found > _FALLING:
+    value = correlation(records)
+    if value > _FALLING:
         return ""
     return (
-        f"The displacement falls while the voltage rises (correlation {found:.2f}): the sensor or"
+        f"The displacement falls while the voltage rises (correlation {value:.2f}): the sensor or"
         " the voltage is probably connected the other way round; change the sign of one column."
     )
 
@@ -422,7 +422,7 @@ def _suggestion(stroke: float, span: float) -> str:
         and ORDINARY_STROKE[0] <= x / v <= ORDINARY_STROKE[1]
     ]
     power = min(fits, key=lambda p: abs(p[0]) + abs(p[1]), default=(0, 0))
-    told = [
+    items = [
         f"the {name} is in {units[p]} (or in units as far apart): correct the header, or give"
         f" --columns {name}=NAME:{units[p].split(',')[0]}"
         for name, p, units in (
@@ -430,4 +430,4 @@ def _suggestion(stroke: float, span: float) -> str:
         )
         if p
     ]  # fmt: skip
-    return f". Perhaps {' and '.join(told)}" if told else ""
+    return f". Perhaps {' and '.join(items)}" if items else ""

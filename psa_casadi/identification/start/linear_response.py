@@ -57,8 +57,8 @@ def mode(pole: complex, residue: complex, x: FloatArray, h: float) -> FloatArray
         lower = [1.0, -2.0 * np.real(decay), abs(decay) ** 2]
     else:
         upper, lower = np.real([now, before]), [1.0, -np.real(decay)]
-    found: FloatArray = filtered(upper, lower, x)  # scipy.signal is slow to load
-    return found
+    values: FloatArray = filtered(upper, lower, x)  # scipy.signal is slow to load
+    return values
 
 
 def _weights(pole: complex, residue: complex, h: float) -> tuple[complex, complex, complex]:
@@ -161,20 +161,20 @@ def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _apart(poles: ComplexArray) -> ComplexArray:
     """Return the poles in conjugate pairs, each about `_APART` or more from every other."""
-    own: list[complex] = []
+    item: list[complex] = []
     real: list[float] = []
     for pole in poles[poles.imag >= 0]:
         size, moved = abs(pole), complex(pole)
         if pole.imag > _APART * size:
-            while any(abs(moved - other) < _APART * size for other in own):
+            while any(abs(moved - other) < _APART * size for other in item):
                 moved *= 1.0 + _APART
-            own += [moved, moved.conjugate()]
+            item += [moved, moved.conjugate()]
         else:
             real += [log(size), log(size)] if pole.imag else [log(size)]
     real.sort()
     for k in range(1, len(real)):
         real[k] = max(real[k], real[k - 1] + _APART)
-    return np.array([*own, *(-exp(place) for place in real)], dtype=np.complex128)
+    return np.array([*item, *(-exp(place) for place in real)], dtype=np.complex128)
 
 
 _ROUNDS = 10
@@ -213,7 +213,7 @@ def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatAr
 
     Shape (order,); the two poles of a pair share one figure.
     """
-    found = np.zeros(poles.size)
+    values = np.zeros(poles.size)
     for r in responses:
         columns = _columns(poles, r.w, r.h)
         matrix = np.column_stack([columns, np.ones(r.y.size)])[r.valid]
@@ -222,8 +222,8 @@ def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatAr
         for i, k in _places(poles):
             width = 2 if poles[i].imag else 1
             part = columns[:, k : k + width] @ weights[k : k + width]
-            found[i : i + width] = np.maximum(found[i : i + width], np.std(part) / r.sigma)
-    return found
+            values[i : i + width] = np.maximum(values[i : i + width], np.std(part) / r.sigma)
+    return values
 
 
 def _relocated(responses: Sequence[Response], poles: ComplexArray) -> ComplexArray:
@@ -348,14 +348,14 @@ def modes_of(
         rests = [float(np.sum(left_of(left, pole[None]) ** 2)) for pole in grid]
         trial = np.vstack([poles, grid[int(np.argmin(rests))]])
         low, high = (np.tile(edge, len(trial)) for edge in edges)
-        found = scipy.optimize.least_squares(  # all poles moved to where their modes leave less
+        result = scipy.optimize.least_squares(  # all poles moved to where their modes leave less
             of_all,
             np.clip(trial.ravel(), low + 1e-6, high - 1e-6),
             bounds=(low, high),
             x_scale=np.tile([0.01, 0.3], len(trial)),
             max_nfev=_EVALUATIONS,
         )
-        trial = found.x.reshape(-1, 2)
+        trial = result.x.reshape(-1, 2)
         rest = left_of(target, trial)
         if np.linalg.norm(rest) > better * np.linalg.norm(left):
             break

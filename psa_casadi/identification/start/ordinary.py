@@ -59,12 +59,12 @@ def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
             f"The model '{model.name}' has no hysteresis of its own to give another form; leave"
             " --hysteresis out."
         )
-    found = []
+    items = []
     for name in FORMS if hysteresis == "best" else (hysteresis,):
-        own = [FORMS[name] if c.name in known else c for c in model.components]
-        there = {c.name for c in own}
-        found.append(model.with_components(c for c in own if set(c.needs) <= there))
-    return tuple(found)
+        item = [FORMS[name] if c.name in known else c for c in model.components]
+        there = {c.name for c in item}
+        items.append(model.with_components(c for c in item if set(c.needs) <= there))
+    return tuple(items)
 
 
 #: Times T that are tried, over the sampling interval, and how often the grid closes in.
@@ -102,12 +102,12 @@ class Capacitance:
 
     def sentence(self, value: float) -> str:
         """What the current says, in words; `value` [F] is that of the model."""
-        found = note(
+        result = note(
             "capacitance", source=self.source, value=1e6 * self.value, low=1e6 * self.interval.low,
             high=1e6 * self.interval.high, share=100 * self.explained,
         )  # fmt: skip
         kept = () if self.is_that_of(value) else (note("capacitance_kept", value=1e6 * value),)
-        return " ".join(texts((found, *kept)))
+        return " ".join(texts((result, *kept)))
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
@@ -116,24 +116,24 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
     explained badly. Records with uneven time steps tell nothing.
     """
-    own = [
+    item = [
         r
         for r in records
         if r.current is not None
         and r.n > 3
         and np.ptp(np.diff(r.time)) < _UNEVEN * np.mean(np.diff(r.time))
     ]
-    shown = [np.asarray(r.current, dtype=np.float64) for r in own]
-    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in shown)
+    items = [np.asarray(r.current, dtype=np.float64) for r in item]
+    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in items)
     if total == 0.0:
         return _by_charge(records)
-    times = min(r.sample_time for r in own) * _TIMES
+    times = min(r.sample_time for r in item) * _TIMES
     for _ in range(_ROUNDS):
-        left = [_solved(own, float(q))[1] for q in times]
+        left = [_solved(item, float(q))[1] for q in times]
         k = int(np.argmin(left))
         best = float(times[k])
         times = np.geomspace(times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)], len(_TIMES))
-    value, rest, error = _solved(own, best)
+    value, rest, error = _solved(item, best)
     explained = 1.0 - rest / total
     if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
         return None
@@ -142,8 +142,8 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
 
 def _by_charge(records: Sequence[Record]) -> Capacitance | None:
     """Return the charge per volt, every record about its mean; None without a charge."""
-    given = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
-    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in given]
+    items = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
+    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in items]
     power = sum(float(v @ v) for v, _ in pairs)
     total = sum(float(q @ q) for _, q in pairs)
     if power == 0.0 or total == 0.0:
@@ -166,25 +166,25 @@ def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float
     for k, record in enumerate(records):
         keep = float(np.exp(-record.sample_time / time))
         rate = np.append(0.0, np.diff(record.voltage) / np.diff(record.time))
-        own = np.zeros((record.n, 1 + 2 * len(records)))
-        own[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
-        own[:, 1 + 2 * k] = 1.0
-        own[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
-        every.append(own)
+        item = np.zeros((record.n, 1 + 2 * len(records)))
+        item[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
+        item[:, 1 + 2 * k] = 1.0
+        item[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
+        every.append(item)
     columns = np.vstack(every)
     scale = np.linalg.norm(columns, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     columns /= scale
-    shown = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
-    found, *_ = np.linalg.lstsq(columns, shown, rcond=None)
-    rest = shown - columns @ found
+    displayed = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
+    result, *_ = np.linalg.lstsq(columns, displayed, rcond=None)
+    rest = displayed - columns @ result
     power = float(rest @ rest)
-    alike = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
-    inflation = (1.0 + alike) / (1.0 - alike)
+    similar = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
+    inflation = (1.0 + similar) / (1.0 - similar)
     spread = np.linalg.pinv(columns.T @ columns, hermitian=True)[0, 0]
     freedom = max(len(rest) - columns.shape[1], 1)
     error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
-    return float(found[0] / scale[0]), power, error
+    return float(result[0] / scale[0]), power, error
 
 
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
@@ -224,13 +224,13 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     sample_time = min(r.sample_time for r in records)
     k_l = max(abs(static_slope(records)), 1e-12) / (1.0 / k_p + 1.0 / k_b)
-    told = capacitance_of(records)
+    capacitance = capacitance_of(records)
     values = {
         "u_rated": max(span, top),
         "k_L": k_l,
         "h_ref": _HYSTERESIS_SHARE * k_l * span,
         "hold_rate": 1e-3 * span,
-        "C_p": _CAPACITANCE if told is None else told.value,
+        "C_p": _CAPACITANCE if capacitance is None else capacitance.value,
         "k_P": k_p,
         "k_B": k_b,
         **{name: share * k_l for name, share in LOOP_SHAPES[0].items() if name != "n"},
@@ -262,9 +262,9 @@ def chosen_start(
     model = model.with_declared_starts()
     if stiffness is None:
         return model, model.provenance.force_scale == "given"
-    own = next(model.values[name] for name in ("k_B", "k") if name in model.values)
+    item = next(model.values[name] for name in ("k_B", "k") if name in model.values)
     forces = [p for p in model.structure.parameters if p.unit == "kg" or p.unit[:1] == "N"]
-    scaled = {p.name: model.values[p.name] * stiffness / own for p in forces}
+    scaled = {p.name: model.values[p.name] * stiffness / item for p in forces}
     return model.with_values(scaled), True
 
 
@@ -363,11 +363,11 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     low = np.array([_K[0], _N[0], *[-_DOUBT] * len(loops)])
     high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
     none = [0.0] * len(loops)
-    found = [
+    items = [
         scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
         for start in _STARTS
     ]
-    best = min(found, key=lambda f: float(f.cost)).x
+    best = min(items, key=lambda f: float(f.cost)).x
     s, beta, gamma, delta = parts(best)[0]
     k = best[0] * slope
     values = {"k_L": k, "A": s - k, "beta": beta, "gamma": gamma, "delta": delta}

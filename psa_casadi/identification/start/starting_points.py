@@ -120,16 +120,16 @@ class _Samples:
 
 def excerpts(records: Sequence[Record]) -> list[Excerpt]:
     """Return the excerpts in which a static loop misses what is there, the clearest first."""
-    found = [e for r in records for e in _of_record(r)]
-    shown = [
+    result = [e for r in records for e in _of_record(r)]
+    items = [
         e
-        for e in found
+        for e in result
         if (e.static > _SHOWS_FAST * e.range if _fast(e) else e.missed > _SHOWS_SLOW * e.range)
     ]
-    shown.sort(key=lambda e: e.range / e.static)
-    fastest = min((e.crossing for e in shown), default=0.0)
+    items.sort(key=lambda e: e.range / e.static)
+    fastest = min((e.crossing for e in items), default=0.0)
     kept: list[Excerpt] = []
-    for e in shown:
+    for e in items:
         room = not kept or sum(k.y.size for k in kept) + e.y.size <= SAMPLES
         if room and e.crossing <= _SLOWER * fastest:
             kept.append(e)
@@ -148,13 +148,13 @@ def _of_record(record: Record) -> list[Excerpt]:
     if whole.v.size <= MOST:
         return _excerpt(record.name, whole)
     start = fastest_part(whole.v, MOST)
-    found = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
+    result = _excerpt(f"{record.name}, fastest part", whole.part(start, start + MOST))
     coarse = whole.part(0, whole.v.size, -(-whole.v.size // MOST))
     at = np.arange(whole.v.size) * whole.h
-    missed = np.interp(at, np.arange(coarse.v.size) * coarse.h, coarse.v) - whole.v
-    if np.std(missed) < 0.02 * np.ptp(whole.v):
-        found += _excerpt(f"{record.name}, coarse", coarse)
-    return found
+    misfit = np.interp(at, np.arange(coarse.v.size) * coarse.h, coarse.v) - whole.v
+    if np.std(misfit) < 0.02 * np.ptp(whole.v):
+        result += _excerpt(f"{record.name}, coarse", coarse)
+    return result
 
 
 def _excerpt(name: str, samples: _Samples) -> list[Excerpt]:
@@ -170,9 +170,11 @@ def _excerpt(name: str, samples: _Samples) -> list[Excerpt]:
     filled = np.interp(np.arange(y.size), np.flatnonzero(np.isfinite(y)), y[np.isfinite(y)])
     moved = filled - np.mean(filled[: max(rest, 1)])
     loop, static = _static_loop(v - v[0], moved, valid)
-    found = Excerpt(name, samples.h, samples.longest, v - v[0], moved, valid, 0.0, loop, static)
-    noise = max(high_frequency_noise(filled[valid]), _NOISE[0] * found.range)
-    return [replace(found, sigma=min(noise, _NOISE[1] * found.range) if _fast(found) else noise)]
+    excerpt = Excerpt(name, samples.h, samples.longest, v - v[0], moved, valid, 0.0, loop, static)
+    noise = max(high_frequency_noise(filled[valid]), _NOISE[0] * excerpt.range)
+    return [
+        replace(excerpt, sigma=min(noise, _NOISE[1] * excerpt.range) if _fast(excerpt) else noise)
+    ]
 
 
 def _static_loop(v: FloatArray, y: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
@@ -316,28 +318,28 @@ def fit_linear(
         residual = np.concatenate([*(r for r, _ in each), *priors])
         return residual, np.vstack([*(j for _, j in each), np.diag(weights), _TYPICAL[:, free]])
 
-    found = minimise(
+    minimum = minimise(
         evaluate, start[free], (low[free], high[free]),
         tolerance=_TOLERANCE, evaluations=evaluations,
     )  # fmt: skip
-    if found is None:  # the objective is finite wherever the bounds allow
+    if minimum is None:  # the objective is finite wherever the bounds allow
         raise ArithmeticError("The linear fit has no value at its start.")
     theta = start.copy()
-    theta[free] = found.theta
+    theta[free] = minimum.theta
     data, first = [], 0
     for e in parts:
         count = int(e.valid.sum())
-        data.append(found.residual[first : first + count])
+        data.append(minimum.residual[first : first + count])
         first += count + _weights_of(e)
     level = max(1.0, float(np.mean(np.concatenate(data) ** 2)))
-    information = found.jacobian.T @ found.jacobian / level
+    information = minimum.jacobian.T @ minimum.jacobian / level
     errors = np.full(7, np.nan)
     errors[free] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
     residuals = [e.sigma * r for e, r in zip(parts, data, strict=True)]
     return LinearFit(
         theta=theta,
         errors=errors,
-        cost=found.cost,
+        cost=minimum.cost,
         left=tuple(float(np.sqrt(np.mean(r**2))) for r in residuals),
         white=tuple(high_frequency_noise(r) for r in residuals),
     )
@@ -530,8 +532,8 @@ def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
     free = fit_linear(parts, fixed.theta, ratio_free=True, evaluations=_FULL)
     samples = sum(int(e.valid.sum()) for e in parts)
     level = max(1.0, free.cost / samples)
-    told = free.errors[-1] < 0.5 and fixed.cost - free.cost > level * log(samples)
-    return free if told else fixed
+    output = free.errors[-1] < 0.5 and fixed.cost - free.cost > level * log(samples)
+    return free if output else fixed
 
 
 def _different(fits: Iterable[LinearFit]) -> list[LinearFit]:
@@ -547,7 +549,7 @@ def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> Li
     size = dict(zip(COORDINATES, np.exp(fit.theta).tolist(), strict=True))
     ratio_free, k_B = not np.isnan(fit.errors[-1]), values["k_B"]
     k_P = size["r"] * k_B if ratio_free else values["k_P"]
-    found = {
+    table = {
         "R_s": size["T"] / values["C_p"],
         "tau": size["tau"],
         "c_P": size["a_P"] * k_P,
@@ -556,12 +558,12 @@ def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> Li
         "m_B": size["q_B"] * k_B,
         "k_P": k_P,
     }
-    told = tuple(n for n, e in zip(found, fit.errors, strict=True) if e < 0.5)
+    output = tuple(n for n, e in zip(table, fit.errors, strict=True) if e < 0.5)
     if not ratio_free:
-        del found["k_P"]
+        del table["k_P"]
     bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    within = {n: float(np.clip(v, *bounds[n])) for n, v in found.items()}
-    return LinearCandidate(within, misfit, told)
+    within = {n: float(np.clip(v, *bounds[n])) for n, v in table.items()}
+    return LinearCandidate(within, misfit, output)
 
 
 def placed(
@@ -577,9 +579,9 @@ def placed(
         share = contributions(response, poles)
         least = min(1.0, share.max())
         for level in {least, share.max()} if weak else {least}:
-            for own in arrangements(poles[share >= _COUNTS * level], e.h):
+            for item in arrangements(poles[share >= _COUNTS * level], e.h):
                 for ratio in ratios:
-                    yield np.append(own, ratio)
+                    yield np.append(item, ratio)
 
 
 def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
@@ -593,19 +595,19 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
     tones = sorted((p for p in poles if p.imag > 0), key=abs)
     fast = max(0.3 * min([1.0 / abs(p) for p in poles]), 0.25 * interval)
     pairs = [(-2.0 * p.real / abs(p) ** 2, 1.0 / abs(p) ** 2) for p in tones[:2]]
-    found = []
+    items = []
     for lags in (2, 1) if len(times) > 1 else (2,):
-        own = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
+        item = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
         left = times[lags:]
         both = list(pairs)
         while len(both) < 2:
             one, two = [*left, fast, 0.7 * fast][:2]
             left = left[2:]
             both.append((one + two, one * two))
-        for tau, drive in {(own[0], own[1]), (own[1], own[0])}:
+        for tau, drive in {(item[0], item[1]), (item[1], item[0])}:
             for b, p in {(both[0], both[1]), (both[1], both[0])}:
-                found.append(np.log([drive, tau, *p, *b]))
-    return found
+                items.append(np.log([drive, tau, *p, *b]))
+    return items
 
 
 #: Candidate dynamics that miss the fast records this much more than the best are not tried.
@@ -627,9 +629,9 @@ def starting_points(
     shapes: list[tuple[str, dict[str, float]]] = [("the model's own loop", {})]
     if has_loop(model):
         shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
-        shown = loop_start(model, records)
-        if shown is not None:
-            shapes = [("the records' loops", shown), *shapes[: 1 if linear else 2]]
+        displayed = loop_start(model, records)
+        if displayed is not None:
+            shapes = [("the records' loops", displayed), *shapes[: 1 if linear else 2]]
     if not linear:
         return shapes
     bounds = {p.name: p.bounds for p in model.structure.parameters}
@@ -685,11 +687,11 @@ def _creep_slowest(model: Model, values: Mapping[str, float]) -> dict[str, float
     """Return dynamics of lags alone: ordinary masses, the creep lag exchanged with a slower c/k."""
     ordinary = {k: v for k, v in values.items() if k not in (*_MASSES, "k_P")}
     stiffness = {c: model.values[c.replace("c", "k")] for c in ("c_P", "c_B")}
-    shown = {c: values[c] / {**model.values, **values}[c.replace("c", "k")] for c in stiffness}
-    ordinary |= {c: lag * stiffness[c] for c, lag in shown.items()}
-    slow = max(shown, key=lambda c: shown[c])
-    if shown[slow] > values["tau"]:
-        ordinary |= {"tau": shown[slow], slow: values["tau"] * stiffness[slow]}
+    table = {c: values[c] / {**model.values, **values}[c.replace("c", "k")] for c in stiffness}
+    ordinary |= {c: lag * stiffness[c] for c, lag in table.items()}
+    slow = max(table, key=lambda c: table[c])
+    if table[slow] > values["tau"]:
+        ordinary |= {"tau": table[slow], slow: values["tau"] * stiffness[slow]}
     return ordinary
 
 

@@ -54,8 +54,8 @@ class Beat:
 
     def saw(self, along: FloatArray) -> FloatArray:
         """Return the saw tooth, 0 to 1, at times along the record, 0 to 1."""
-        found: FloatArray = (self.phase + self.beats * along) % 1.0
-        return found
+        values: FloatArray = (self.phase + self.beats * along) % 1.0
+        return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +102,11 @@ class Delays:
         removed = self._fitted(line)[2] - left
         if removed < _CLEAR * scatter or smooth - left < _SHARPER * scatter:
             return False
-        alike = []
+        items = []
         for half in (along < 0.5, along >= 0.5):
             height, variance, left = self._fitted(np.column_stack([saw, one]), half)
             deviation = (left / max(half.sum() - 2, 1) * variance) ** 0.5
-            alike.append(self._alike(height, deviation, beat, _HALF))
+            items.append(self._alike(height, deviation, beat, _HALF))
         ends = np.arange(ceil(beat.phase), floor(beat.phase + beat.beats) + 1)
         jumps = 0
         for at in (ends - beat.phase) / beat.beats:
@@ -117,9 +117,9 @@ class Delays:
             columns = np.column_stack([along < at, one, along - at])
             height, variance, left = self._fitted(columns, near)
             deviation = (max(scatter, left / (near.sum() - 3)) * variance) ** 0.5
-            alike.append(self._alike(height, deviation, beat, _JUMP))
+            items.append(self._alike(height, deviation, beat, _JUMP))
             jumps += 1
-        return jumps >= _JUMPS and all(alike)
+        return jumps >= _JUMPS and all(items)
 
     def _scanned(self, beats: FloatArray, phases: FloatArray) -> Beat:
         root, along = np.sqrt(self.weight), self.along
@@ -131,11 +131,11 @@ class Delays:
             saws = root[:, None] * ((phases + rate * along[:, None]) % 1.0)
             saws -= line @ (line.T @ saws)
             power = np.maximum(np.sum(saws**2, axis=0), 1e-300)
-            told = saws.T @ wanted
-            k = int(np.argmax(told**2 / power))
-            removed = float(told[k] ** 2 / power[k])
+            output = saws.T @ wanted
+            k = int(np.argmax(output**2 / power))
+            removed = float(output[k] ** 2 / power[k])
             if removed > best[0]:
-                best = removed, Beat(rate, float(phases[k]) % 1.0, float(told[k] / power[k]))
+                best = removed, Beat(rate, float(phases[k]) % 1.0, float(output[k] / power[k]))
         return best[1]
 
     def _fitted(
@@ -212,11 +212,11 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[Note, ...]]:
 
     Name, `source` and `sha256` are kept: the correction repeats from the file.
     """
-    found = two_clocks(record)
-    if found is None:
+    result = two_clocks(record)
+    if result is None:
         return record, ()
-    undone = replace(found.undone(record), source=record.source, sha256=record.sha256)
-    return undone, (found.note(record, "clocks_undone"),)
+    undone = replace(result.undone(record), source=record.source, sha256=record.sha256)
+    return undone, (result.note(record, "clocks_undone"),)
 
 
 def two_clocks(record: Record) -> TwoClocks | None:

@@ -77,13 +77,13 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, request: Requ
             guess[name] = Field(labels.index(source.array), source.unit or "")
     units = tuple(stated_unit(text) or "" for text in one.header)
     names = tuple("" if MARKS.search(label) else label for label in one.labels)
-    shown = [
+    items = [
         [f"{c:.9g}" for c in cells[:count]]
         if isinstance(cells, np.ndarray) and cells.dtype.kind in "biuf"
         else [str(c)[:40] for c in cells[:count]]
         for cells in one.glance
     ]
-    rows = tuple(zip_longest(*shown, fillvalue=""))
+    rows = tuple(zip_longest(*items, fillvalue=""))
     return Head(names, units, rows, guess, tuple(parts) if len(parts) > 1 else ())
 
 
@@ -124,10 +124,10 @@ def head_of(path: str | Path, count: int = 8, table: str = "", names: tuple[str,
     request = Request(table=table, names=names, needed=names or Request.needed)
     if not ending_of(place):
         return head_of_tables(place, text_of(place)[0], count, request)
-    told = answered_apart(Asked(place, request, count=count))
-    if told.head is None:
-        raise InputError(told.outcome.problems)
-    return told.head
+    answer = answered_apart(Asked(place, request, count=count))
+    if answer.head is None:
+        raise InputError(answer.outcome.problems)
+    return answer.head
 
 
 def text_of(path: str) -> tuple[Sequence[Table], str]:
@@ -145,9 +145,9 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
     return text_tables(path, text.split("\n"), "line"), digest
 
 
-def answered_apart(asked: Asked) -> Answer:
+def answered_apart(requested: Asked) -> Answer:
     """Return what `answered` does in a process of its own."""
-    path = asked.path
+    path = requested.path
     check_there(path)
     _, package, _ = READERS[ending_of(path)]
     if find_spec(package) is None:
@@ -157,10 +157,10 @@ def answered_apart(asked: Asked) -> Answer:
         )
     size = Path(path).stat().st_size
     limit = _TIME + _TIME_PER_MIB * size / 2**20
-    asked = replace(asked, memory=_MEMORY + _MEMORY_PER_BYTE * size)
+    requested = replace(requested, memory=_MEMORY + _MEMORY_PER_BYTE * size)
     try:
         with started_python(
-            _MODULE, json.dumps(msgspec.to_builtins(asked)),
+            _MODULE, json.dumps(msgspec.to_builtins(requested)),
             OPENBLAS_NUM_THREADS="1", ARROW_DEFAULT_MEMORY_POOL="system",
         ) as child:  # fmt: skip
             done = heard(child, limit=limit)
@@ -195,39 +195,41 @@ def _refused(*problems: str) -> Answer:
     return Answer(Outcome(problems))
 
 
-def answered(asked: Asked) -> Answer:
+def answered(requested: Asked) -> Answer:
     """Return what is told of a file, read in this process."""
-    path = asked.path
+    path = requested.path
     try:
         tables = READERS[ending_of(path)][0](path)
-        if asked.count:
-            return Answer(Outcome(), head_of_tables(path, tables, asked.count, asked.request))
-        outcome = samples_of(path, tables, asked.request)
+        if requested.count:
+            return Answer(
+                Outcome(), head_of_tables(path, tables, requested.count, requested.request)
+            )
+        outcome = samples_of(path, tables, requested.request)
     except InputError as error:
         return _refused(*error.problems)
     except MemoryError:
         return _refused(f"{path}: needs more memory than a record may; split it.")
     except Exception as error:  # noqa: BLE001 - a library may raise anything on a damaged file
-        said = str(error).splitlines()
-        return _unreadable(path, said[0][:120] if said else type(error).__name__)
+        statement = str(error).splitlines()
+        return _unreadable(path, statement[0][:120] if statement else type(error).__name__)
     with Path(path).open("rb") as stream:
         outcome.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
     if outcome.units:
-        np.save(Path(asked.out) / "values.npy", outcome.values)
+        np.save(Path(requested.out) / "values.npy", outcome.values)
     return Answer(outcome)
 
 
 def main() -> None:
     """Answer what is asked on the command line on standard output, in JSON."""
     end_with_parent()
-    asked = msgspec.convert(json.loads(sys.argv[1]), Asked)
+    value = msgspec.convert(json.loads(sys.argv[1]), Asked)
     if sys.platform != "win32":
         import resource  # noqa: PLC0415
 
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        limit = asked.memory if hard == resource.RLIM_INFINITY else min(asked.memory, hard)
+        limit = value.memory if hard == resource.RLIM_INFINITY else min(value.memory, hard)
         resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
-    sys.stdout.write(f"\n{text_in(answered(asked))}\n")
+    sys.stdout.write(f"\n{text_in(answered(value))}\n")
 
 
 if __name__ == "__main__":

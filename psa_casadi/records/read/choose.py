@@ -76,13 +76,13 @@ class Cell:
 
     def rank(self, column: str) -> int | None:
         """Return how likely it is a column, 0 for the most likely; None where it is not."""
-        says = self.speaks(column)
-        if self.column not in (None, column) or (self.column is None and says < 0):
+        number = self.speaks(column)
+        if self.column not in (None, column) or (self.column is None and number < 0):
             return None
         if self.hint is None or measures(column, self.hint):
-            return 0 if self.column else (2 if self.hint else 4) - says
+            return 0 if self.column else (2 if self.hint else 4) - number
         in_volts = column == "displacement" and measures("voltage", self.hint)
-        return 6 - says if in_volts and not self.words & _FOR["voltage"] else None
+        return 6 - number if in_volts and not self.words & _FOR["voltage"] else None
 
     def source(self, column: str) -> Source:
         """Return it as the source of a column, in its own unit or the usual one."""
@@ -146,8 +146,8 @@ class Choice:
         places = {name: time if name == "time" else next(rest, None) for name in required}
         self.sources = {n: usual_source(n, str(k + 1)) for n, k in places.items() if k is not None}
         example = ",".join(COLUMNS[name].example for name in required)
-        told = f"{table.where}: found '{table.headless[:60]}', expected a header"
-        self.open.append(Question(told, ASK_UNIT, f"write a first line such as '{example}'"))
+        text = f"{table.where}: found '{table.headless[:60]}', expected a header"
+        self.open.append(Question(text, ASK_UNIT, f"write a first line such as '{example}'"))
 
     def _take_own_names(self) -> None:
         """Take the cells with the columns' own names and units, and those that were asked for."""
@@ -156,11 +156,11 @@ class Choice:
         first = any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
         last = last_name if table.sizes else str
         for index, text in enumerate(table.header):
-            asked, (own, unit) = index in places, name_and_unit(text)
-            name = places.get(index, plain(own))
+            requested, (item, unit) = index in places, name_and_unit(text)
+            name = places.get(index, plain(item))
             bare = unit is None and (name in self.required or name == "time")
             second = name == "displacement_2" and first
-            if name not in COLUMNS or (not asked and (bare or second or name in wanted)):
+            if name not in COLUMNS or (not requested and (bare or second or name in wanted)):
                 self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
                 self.problems.add(
@@ -168,12 +168,12 @@ class Choice:
                     f" as column {self.fields[name].index + 1}); rename or remove one of the two."
                 )
             else:
-                place = f"column '{own if asked else name}'"
-                unit = unit or (unit_for(name, last_name(own)) if asked else None)
-                if table.sizes and asked and wanted[name].unit:  # of an array it is often wrong
+                place = f"column '{item if requested else name}'"
+                unit = unit or (unit_for(name, last_name(item)) if requested else None)
+                if table.sizes and requested and wanted[name].unit:  # of an array it is often wrong
                     unit = None
                 is_unit = unit is not None and unit_named(unit, common=False) is not None
-                if not asked and unit and is_unit and not measures(name, unit):
+                if not requested and unit and is_unit and not measures(name, unit):
                     self._ask_scale(
                         name, unit, place, usual_source(name, table.labels[index], unit)
                     )
@@ -228,23 +228,23 @@ class Choice:
 
     def _ask(self, unclear: Mapping[str, Sequence[Cell]], missing: Sequence[str]) -> None:
         """Ask for the columns that are unclear or missing, and suggest what they may be."""
-        where, told = self.table.where, []
+        where, output = self.table.where, []
         in_header = not self.table.sizes
         if unclear:
             which = ", ".join(
-                f"'{name}' {'has no unit' if len(own) == 1 else 'may be more than one column'}"
-                f" ({', '.join(cell.text for cell in own)})"
-                for name, own in unclear.items()
+                f"'{name}' {'has no unit' if len(item) == 1 else 'may be more than one column'}"
+                f" ({', '.join(cell.text for cell in item)})"
+                for name, item in unclear.items()
             )
             examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
             cure = f"write {examples} in the header" if in_header else ""
-            told.append(Question(f"{where}: {which}", ASK_UNIT, cure))
+            output.append(Question(f"{where}: {which}", ASK_UNIT, cure))
         listed = self._listed([name for name in self.fields if name not in unclear])
         for name in missing:
             cure = f"add it to the header as '{COLUMNS[name].example}'" if in_header else ""
             what = f"{where}: the column '{name}' is missing (found: {listed})"
-            told.append(Question(what, ASK_COLUMN, cure))
-        self.open = [*told, *self.open]
+            output.append(Question(what, ASK_COLUMN, cure))
+        self.open = [*output, *self.open]
         chosen = self._suggested([*unclear, *missing])
         self.sources |= {name: cell.source(name) for name, cell in chosen.items()}
         length = chosen.get("displacement")
@@ -265,18 +265,18 @@ class Choice:
         main = max(sizes, key=lambda n: (sizes.count(n), n), default=0)  # of most arrays
         free = [c for c in self.left if not self.table.sizes or self.table.sizes[c.index] == main]
         free = [c for c in free if c.label and not set(c.label) & _MARKS]
-        found: dict[str, Cell] = {}
+        cells: dict[str, Cell] = {}
         for column in (name for name in COLUMNS if name in columns):
-            number = found["voltage"].channel if "voltage" in found else ""
+            number = cells["voltage"].channel if "voltage" in cells else ""
             ranks = [
                 (rank, column == "displacement" and cell.channel != number, k)
                 for k, cell in enumerate(free)
-                if cell not in found.values() and (rank := cell.rank(column)) is not None
+                if cell not in cells.values() and (rank := cell.rank(column)) is not None
                 if column != "time" or rises(self.table, cell.index)
             ]
             if ranks:
-                found[column] = free[min(ranks)[-1]]
-        return found
+                cells[column] = free[min(ranks)[-1]]
+        return cells
 
     def _ask_scale(self, column: str, unit: str, place: str, source: Source) -> None:
         """Ask what 1 in the file is, where the unit measures something else."""
@@ -284,21 +284,22 @@ class Choice:
         self.open.append(Question(f"{self.table.where}, {place}: {what}", _ASK_SCALE, cure))
         self.sources[column] = source
 
-    def _agreed_unit(self, name: str, own: str | None, where: str) -> str:
+    def _agreed_unit(self, name: str, text: str | None, where: str) -> str:
         """Return the unit that the header or `--columns` gives; the two must not disagree."""
         source = self.wanted.get(name)
-        given = source.unit if source else None
+        inputs = source.unit if source else None
         if source and source.scale is not None:  # of the header's unit, as a sensor's volts
-            return given or ""
-        unit = own or given or (SI_UNITS.get(name) if source else None)
+            return inputs or ""
+        unit = text or inputs or (SI_UNITS.get(name) if source else None)
         check_unit(COLUMNS[name], unit, where, self.problems)
         with suppress(InputError):  # an unknown one was told already
-            units = {replace(parse_unit(u), name="", quantity="") for u in (own, given) if u}
+            units = {replace(parse_unit(u), name="", quantity="") for u in (text, inputs) if u}
             if len(units) < 2:
                 return unit or ""
             self.problems.add(
-                f"{where}: the header gives the unit '{own}', --columns gives '{given}'; leave the"
-                f" one in --columns out, or say there what 1 in the file is, such as 10{given}."
+                f"{where}: the header gives the unit '{text}', --columns gives '{inputs}'; leave"
+                " the one in --columns out, or say there what 1 in the file is, such as"
+                f" 10{inputs}."
             )
         return unit or ""
 
@@ -334,21 +335,21 @@ def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list
     """
     named = [c for c in cells if c.column == column]
     quantity = QUANTITIES.get(column, "none") if by_unit else "none"
-    alike = [
+    items = [
         c for c in cells
         if c.column is None and c.unit is not None and c.speaks(column) >= 0
         and parse_unit(c.unit).quantity == quantity
     ]  # fmt: skip
     stating = [c for c in named if c.unit is not None]
     stating = [c for c in stating if measures(column, c.unit or "")] or stating
-    commanded = [c for c in alike if column == "voltage" and c.words & _COMMANDED]
+    commanded = [c for c in items if column == "voltage" and c.words & _COMMANDED]
     if len(stating) == 1 and not commanded:
         return stating, True
     if named:
-        return [*named, *alike], False
+        return [*named, *items], False
     others = [c for c in cells if c.column is None and c.hint is None]
-    rivals = [c for c in others if c.speaks(column) > 0] if alike else []
-    return [*alike, *rivals], len(alike) == 1 and not rivals
+    rivals = [c for c in others if c.speaks(column) > 0] if items else []
+    return [*items, *rivals], len(items) == 1 and not rivals
 
 
 def with_usual_units(table: Table) -> Table:
@@ -388,9 +389,9 @@ def place_of(array: str, table: Table) -> int | None:
     """Return the index of the column that `--columns` names: by its name, its text, its number."""
     meant = plain(array)
     for texts in (table.labels, table.header, [last_name(label) for label in table.labels]):
-        found = [k for k, text in enumerate(texts) if plain(text) == meant]
-        if found:
-            return found[0]
+        items = [k for k, text in enumerate(texts) if plain(text) == meant]
+        if items:
+            return items[0]
     k = int(array) - 1 if array.isdecimal() and len(array) < 6 else -1
     return k if 0 <= k < len(table.header) else None
 
@@ -421,32 +422,32 @@ class ByName:
     ) -> None:
         self.table, self.names, self.problems = table, ("time", *names), problems
         self.open, self.sources = list[Question](), dict[str, Source]()
-        found: dict[str, Field] = {}
-        self._take_asked(found, wanted)
-        self._take_named(found)
-        if "time" not in found and (time := self._time(found)) is not None:
-            found["time"] = time
-        self.fields = {name: found[name] for name in self.names if name in found}
-        self.unread = self._others(found) if len(found) < len(self.names) else ()
-        if "time" in found:
+        fields: dict[str, Field] = {}
+        self._take_asked(fields, wanted)
+        self._take_named(fields)
+        if "time" not in fields and (time := self._time(fields)) is not None:
+            fields["time"] = time
+        self.fields = {name: fields[name] for name in self.names if name in fields}
+        self.unread = self._others(fields) if len(fields) < len(self.names) else ()
+        if "time" in fields:
             where = f"{table.where}, column 'time'"
-            check_unit(COLUMNS["time"], found["time"].unit, where, problems)
-        for name in [n for n in required if n not in found and n not in wanted]:
+            check_unit(COLUMNS["time"], fields["time"].unit, where, problems)
+        for name in [n for n in required if n not in fields and n not in wanted]:
             self._ask(name)
         if self.open and table.headless:
             example = ",".join(self.names)
-            told = f"{table.where}: found '{table.headless[:60]}', expected a header"
-            self.open = [Question(told, ASK_UNIT, f"write a first line such as '{example}'")]
+            text = f"{table.where}: found '{table.headless[:60]}', expected a header"
+            self.open = [Question(text, ASK_UNIT, f"write a first line such as '{example}'")]
         self.sources = {**wanted, **self.sources} if self.sources else {}
 
-    def _take_asked(self, found: dict[str, Field], wanted: ColumnMap) -> None:
+    def _take_asked(self, fields: dict[str, Field], wanted: ColumnMap) -> None:
         """Take what `--columns` names; its unit and that of the header must not disagree."""
         for name, source in wanted.items():
             index = place_of(source.array, self.table)
             if index is None:
                 self.problems.add(
                     f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
-                    f" not in the header (found: {self._listed(found)}); correct --columns."
+                    f" not in the header (found: {self._listed(fields)}); correct --columns."
                 )
                 continue
             stated = stated_unit(self._text(index))
@@ -456,12 +457,12 @@ class ByName:
                     f" '{stated}', --columns gives '{source.unit}'; leave the one in --columns out,"
                     f" or say there what 1 in the file is, such as 10{source.unit}."
                 )
-            found[name] = Field(index, source.unit or stated or self._usual(name))
+            fields[name] = Field(index, source.unit or stated or self._usual(name))
 
-    def _take_named(self, found: dict[str, Field]) -> None:
+    def _take_named(self, fields: dict[str, Field]) -> None:
         """Take the cells that have the names of columns, the nearest in form first."""
-        asked = set(found)
-        taken = {field.index for field in found.values()}
+        requested = set(fields)
+        taken = {field.index for field in fields.values()}
         forms = [
             (rank, text != name, name, index, unit)
             for index in self._cells()
@@ -471,23 +472,23 @@ class ByName:
         ]
         ranks: dict[str, tuple[int, bool]] = {}
         for rank, other_case, name, index, unit in sorted(forms, key=lambda form: form[:2]):
-            if name in found and (name in asked or ranks[name] != (rank, other_case)):
+            if name in fields and (name in requested or ranks[name] != (rank, other_case)):
                 continue
-            if name in found and index not in taken:
+            if name in fields and index not in taken:
                 self.problems.add(
                     f"{self.table.where}, column {index + 1}: '{name}' stands twice in the header"
-                    f" (first as column {found[name].index + 1}); rename or remove one of the two."
+                    f" (first as column {fields[name].index + 1}); rename or remove one of the two."
                 )
             elif index not in taken:
-                found[name], ranks[name] = (
+                fields[name], ranks[name] = (
                     Field(index, unit or self._usual(name)),
                     (rank, other_case),
                 )
                 taken.add(index)
 
-    def _time(self, found: Mapping[str, Field]) -> Field | None:
+    def _time(self, fields: Mapping[str, Field]) -> Field | None:
         """Return a cell with another name for the time, whose values rise."""
-        taken = {field.index for field in found.values()}
+        taken = {field.index for field in fields.values()}
         for index in self._cells():
             meant = understood(self._text(index)) if index not in taken else None
             if meant is not None and meant.column == "time" and rises(self.table, index):

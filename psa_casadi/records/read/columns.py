@@ -79,10 +79,10 @@ def measures(name: str, unit: str) -> bool:
         parsed = parse_unit(unit)
     except InputError:
         return False
-    own = COLUMNS[name].quantities
-    return parsed.quantity in own or (
+    item = COLUMNS[name].quantities
+    return parsed.quantity in item or (
         not parsed.quantity
-        and any(parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in own)
+        and any(parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in item)
     )
 
 
@@ -143,7 +143,7 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
     """
-    found: dict[str, Source] = {}
+    sources: dict[str, Source] = {}
     problems = Problems()
     known = ["time", *names] if names else [*COLUMNS]
     of_key = {_key(n): n for n in known} | {n: n for n in known}
@@ -153,17 +153,17 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
         if match is None or not match["array"].strip():
             problems.add(f"{where}: is not understood; {_FORM}.")
             continue
-        file, at, own = match["name"].strip().rpartition("@")
-        name = of_key.get(own.strip()) or of_key.get(_key(own)) or _key(own)
+        file, at, item = match["name"].strip().rpartition("@")
+        name = of_key.get(item.strip()) or of_key.get(_key(item)) or _key(item)
         key = f"{file.strip()}{at}{name}"
         unit = match["unit"] if match["in"] is None else match["in"]
         if name == TABLE:
-            found[key] = Source(part.partition("=")[2].strip(), None)
+            sources[key] = Source(part.partition("=")[2].strip(), None)
         elif name not in known:
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
             meant = f"is '{near[0]}' meant? There are" if near else "there are"
             problems.add(f"{where}: '{name}' is no column of a record; {meant} {', '.join(known)}.")
-        elif key in found:
+        elif key in sources:
             problems.add(f"{where}: '{key}' is given twice; remove one of the two.")
         else:
             scaled = _SCALED.fullmatch(unit.strip()) if unit else None
@@ -175,15 +175,15 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
                 problems.add(
                     f"{where}: the scale {scale:g} leaves nothing of the numbers; correct it."
                 )
-            found[key] = Source(match["array"].strip(), unit, scale)
+            sources[key] = Source(match["array"].strip(), unit, scale)
     problems.raise_if_any()
-    return found
+    return sources
 
 
 def columns_of(wanted: ColumnMap, file: str) -> ColumnMap:
     """Return what is said of one file: by its name, else what is said of all."""
-    own = {k.removeprefix(f"{file}@"): v for k, v in wanted.items() if k.startswith(f"{file}@")}
-    return own or {k: v for k, v in wanted.items() if "@" not in k}
+    table = {k.removeprefix(f"{file}@"): v for k, v in wanted.items() if k.startswith(f"{file}@")}
+    return table or {k: v for k, v in wanted.items() if "@" not in k}
 
 
 def files_named(wanted: ColumnMap) -> set[str]:

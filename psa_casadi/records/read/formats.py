@@ -48,10 +48,10 @@ class Series:
     def text(self) -> str:
         """The name with its unit: the stated one, or that of a name of its own."""
         last = self.name.rpartition(".")[2]
-        own = last if re.match(r"\w*[^\W\d]", last) else self.name
+        item = last if re.match(r"\w*[^\W\d]", last) else self.name
         unit = self.unit
-        if unit is None and not stated_unit(own):
-            name = understood(own)
+        if unit is None and not stated_unit(item):
+            name = understood(item)
             values = self.values()[:9] if name and name.column == "time" and self.size > 1 else []
             if isinstance(values, np.ndarray) and len(values):
                 is_instant = values.dtype.kind in "mM"
@@ -75,12 +75,12 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
         yield Series(name or "1", numbers.size, lambda: numbers, unit)
     elif numbers.ndim == 2:
         for k, column in enumerate(numbers.T if len(numbers) >= len(numbers.T) else numbers, 1):
-            own = f"{name}.{k}" if name else f"{k}"
-            yield Series(own, column.size, lambda c=column: c, unit)  # type: ignore[misc]
+            text = f"{name}.{k}" if name else f"{k}"
+            yield Series(text, column.size, lambda c=column: c, unit)  # type: ignore[misc]
 
 
 def array_tables(
-    path: str, found: Iterable[Series], stated: Iterable[str] = (), place: str = "sample"
+    path: str, result: Iterable[Series], stated: Iterable[str] = (), place: str = "sample"
 ) -> list[Table]:
     """Return the tables that series make: all of them, then those of each group with several.
 
@@ -90,18 +90,20 @@ def array_tables(
     The first of a name counts. `stated` are lines such as "fs = 1000" that a file has beside them.
     """
     named: dict[str, Series] = {}
-    for one in found:
-        own, bracketed = name_and_unit(one.name)
-        name = MARKS.sub("_", own or one.name.strip())
+    for one in result:
+        item, bracketed = name_and_unit(one.name)
+        name = MARKS.sub("_", item or one.name.strip())
         unit = unit_named(one.unit, common=False) if isinstance(one.unit, str) else None
         unit = unit or (bracketed.strip() if bracketed else None)
         named.setdefault(name, replace(one, name=name, unit=unit))
     series, labels = list(named.values()), list(named)
     scalars = {n.rpartition(".")[2]: s.values() for n, s in named.items() if s.size == 1}
 
-    def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
-        check_size(path, 8 * sum(series[k].size for k in asked if most is None), "its columns hold")
-        cells = [series[k].values()[: most or series[k].size] for k in asked]
+    def load(numbers: Sequence[int], most: int | None, _: Problems) -> Columns:
+        check_size(
+            path, 8 * sum(series[k].size for k in numbers if most is None), "its columns hold"
+        )
+        cells = [series[k].values()[: most or series[k].size] for k in numbers]
         longest = max(map(len, cells), default=0)
         return Columns(cells, np.arange(1, longest + 1))
 
@@ -116,7 +118,7 @@ def array_tables(
         group, _, last = name.rpartition(".")
         groups.setdefault(last if last.isdecimal() else group, []).append(k)
     shared = groups.pop("", [])
-    parts = [whole.part(n, [*shared, *own]) for n, own in groups.items() if len(own) > 1]
+    parts = [whole.part(n, [*shared, *item]) for n, item in groups.items() if len(item) > 1]
     return [whole, *(parts if len(parts) > 1 else [])]
 
 
@@ -143,10 +145,10 @@ def hdf5_tables(path: str) -> list[Table]:
 
     with h5py.File(path, "r") as file:
         held = list(checked_datasets(path, file, set()))
-        found = [s for item in held for s in _of_dataset(path, item)]
+        items = [s for item in held for s in _of_dataset(path, item)]
         about = [file, *held, *(item.parent for item in held)]
         stated = [line for item in about for line in statements(_attributes(item))]
-    return array_tables(path, found, stated)
+    return array_tables(path, items, stated)
 
 
 def _of_dataset(path: str, item: Any) -> Iterator[Series]:
@@ -158,8 +160,8 @@ def _of_dataset(path: str, item: Any) -> Iterator[Series]:
 
     def read() -> Any:
         with h5py.File(path, "r") as file:
-            found = file[place]
-            return found.asstr()[()].ravel().tolist() if found.dtype.kind == "O" else found[()]
+            result = file[place]
+            return result.asstr()[()].ravel().tolist() if result.dtype.kind == "O" else result[()]
 
     if not item.shape:
         return
@@ -172,21 +174,21 @@ def _of_dataset(path: str, item: Any) -> Iterator[Series]:
         yield Series(name, size, read)
 
 
-def checked_datasets(path: str, group: Any, seen: set[int]) -> list[Any]:
+def checked_datasets(path: str, group: Any, numbers: set[int]) -> list[Any]:
     """Return the datasets below a group. Links are not followed, and none lies in another file."""
     import h5py  # noqa: PLC0415
 
     address = h5py.h5o.get_info(group.id).addr
-    if address in seen:
+    if address in numbers:
         raise ValueError(f"the group '{group.name}' is reached twice")
-    seen.add(address)
-    found = []
+    numbers.add(address)
+    items = []
     for name in group:
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
         item = group[name]
         if isinstance(item, h5py.Group):
-            found += checked_datasets(path, item, seen)
+            items += checked_datasets(path, item, numbers)
         elif isinstance(item, h5py.Dataset) and item.shape is not None:
             if item.external or item.is_virtual:
                 raise InputError(
@@ -196,21 +198,21 @@ def checked_datasets(path: str, group: Any, seen: set[int]) -> list[Any]:
             if item.chunks:
                 piece = math.prod(item.chunks) * item.dtype.itemsize
                 check_size(path, piece, f"a piece of the array '{item.name}' holds")
-            found.append(item)
-    return found
+            items.append(item)
+    return items
 
 
 def _attributes(item: Any) -> dict[str, Any]:
     """Return the attributes with their keys in lower case, texts as such."""
-    found = {}
+    table = {}
     for key in item.attrs:
         value = item.attrs[key]
         if isinstance(value, np.ndarray) and value.size == 1:
             value = value.reshape(-1)[0]
-        found[str(key).lower()] = (
+        table[str(key).lower()] = (
             value.decode("utf-8", "replace") if isinstance(value, bytes) else value
         )
-    return found
+    return table
 
 
 def matlab_tables(path: str) -> list[Table]:
@@ -268,10 +270,10 @@ def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
     There `X` holds the time in seconds as `Data`, and each element of `Y` a signal with its `Name`.
     Where there are several times, or signals of one name, they are counted.
     """
-    found: list[tuple[str, Any, str | None]] = []
+    result: list[tuple[str, Any, str | None]] = []
     for axis, usual in (("X", "s"), ("Y", "")):
-        own = _elements(value.get(axis))
-        several = own if isinstance(own, list) else [own]
+        item = _elements(value.get(axis))
+        several = item if isinstance(item, list) else [item]
         data = [s.get("Data") if isinstance(s, Mapping) else None for s in several]
         if not all(isinstance(numbers, np.ndarray) for numbers in data):
             return []
@@ -285,8 +287,8 @@ def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
         if "" in names or len(set(names)) < len(names):
             names = [f"{axis}.{k}" for k in range(1, len(names) + 1)]
         for name, text, unit, numbers in zip(names, texts, units, data, strict=True):
-            found.append((name, numbers, unit or stated_unit(text) or usual))
-    return found
+            result.append((name, numbers, unit or stated_unit(text) or usual))
+    return result
 
 
 def _modelica(path: str) -> Iterator[Series]:
@@ -296,21 +298,21 @@ def _modelica(path: str) -> Iterator[Series]:
     """
     from scipy.io import loadmat  # noqa: PLC0415
 
-    found = loadmat(path, chars_as_strings=False)
-    upright = "".join(found["Aclass"][3]).strip("\0 ") != "binTrans"
+    result = loadmat(path, chars_as_strings=False)
+    upright = "".join(result["Aclass"][3]).strip("\0 ") != "binTrans"
     name, info, units = (
-        found[k] if upright else found[k].T for k in ("name", "dataInfo", "description")
+        result[k] if upright else result[k].T for k in ("name", "dataInfo", "description")
     )
     for text, (block, at, *_), about in zip(name, np.atleast_2d(info), units, strict=True):
-        data = found.get(f"data_{block or 2}")
+        data = result.get(f"data_{block or 2}")
         if data is None or at == 0:
             continue
         row = (data.T if upright else data)[abs(int(at)) - 1]
         unit = re.search(r"\[([^\]|]*)", "".join(about))
-        own = "".join(text).strip("\0 ")
-        is_time = own.lower() == "time"
+        item = "".join(text).strip("\0 ")
+        is_time = item.lower() == "time"
         stated = unit[1] if unit else "s" if is_time else None
-        yield from series_in("time" if is_time else own, np.sign(at) * row, stated)
+        yield from series_in("time" if is_time else item, np.sign(at) * row, stated)
 
 
 _MARKS = str.maketrans(dict.fromkeys('\t\r\n;"', " "))
@@ -321,17 +323,17 @@ def excel_tables(path: str) -> list[Table]:
     from python_calamine import CalamineWorkbook, SheetVisibleEnum  # noqa: PLC0415
 
     book = CalamineWorkbook.from_path(path)
-    shown = sorted(
+    items = sorted(
         book.sheets_metadata, key=lambda sheet: sheet.visible != SheetVisibleEnum.Visible
     )
-    found = []
-    for sheet in shown:
+    result = []
+    for sheet in items:
         rows = book.get_sheet_by_name(sheet.name).to_python(skip_empty_area=False)
         cells = [list(map(_cell_text, row)) for row in rows]
         kept = [k for k, column in enumerate(zip_longest(*cells)) if any(column)]
         lines = ["\t".join(row[k] for k in kept) if any(row) else "" for row in cells]
-        found += text_tables(path, lines, "row", sheet.name)
-    return found
+        result += text_tables(path, lines, "row", sheet.name)
+    return result
 
 
 def _cell_text(cell: object) -> str:
@@ -357,19 +359,19 @@ def tdms_tables(path: str) -> list[Table]:
     if sum(len(c) * c.dtype.itemsize for c in channels) > 2 * Path(path).stat().st_size:
         raise ValueError("it states more numbers than it has bytes for")
     several = len(file.groups()) > 1
-    found, stated = list[Series](), list[str]()
+    result, stated = list[Series](), list[str]()
     for channel in channels:
         if channel.dtype.kind not in "biufM":
             continue
         name = f"{channel.group_name}.{channel.name}" if several else channel.name
 
-        def read(group: str = channel.group_name, own: str = channel.name) -> Cells:
+        def read(group: str = channel.group_name, text: str = channel.name) -> Cells:
             with nptdms.TdmsFile.open(path) as whole:
-                return np.asarray(whole[group][own][:])
+                return np.asarray(whole[group][text][:])
 
-        found.append(Series(name, len(channel), read, _unit_in(channel.properties)))
+        result.append(Series(name, len(channel), read, _unit_in(channel.properties)))
         stated += statements({k: v for k, v in channel.properties.items() if k == "wf_increment"})
-    return array_tables(path, found, stated)
+    return array_tables(path, result, stated)
 
 
 def parquet_tables(path: str) -> list[Table]:
@@ -387,11 +389,11 @@ def parquet_tables(path: str) -> list[Table]:
     def read(name: str) -> Cells:
         return _arrow_cells((whole or file.read([name], use_threads=False)).column(name), rows)
 
-    found = []
+    items = []
     for field in schema:
         about = {k.decode(): v.decode() for k, v in (field.metadata or {}).items()}
-        found.append(Series(field.name, rows, partial(read, field.name), _unit_in(about)))
-    return array_tables(path, found, place="row")
+        items.append(Series(field.name, rows, partial(read, field.name), _unit_in(about)))
+    return array_tables(path, items, place="row")
 
 
 def _arrow_cells(column: Any, rows: int) -> Cells:
@@ -419,19 +421,19 @@ def numpy_tables(path: str) -> list[Table]:
 
     Nothing is unpickled.
     """
-    found = np.load(path, allow_pickle=False, mmap_mode="r" if path.endswith(".npy") else None)
-    if isinstance(found, np.ndarray):
-        return array_tables(path, series_in("", found))
+    content = np.load(path, allow_pickle=False, mmap_mode="r" if path.endswith(".npy") else None)
+    if isinstance(content, np.ndarray):
+        return array_tables(path, series_in("", content))
     with zipfile.ZipFile(path) as archive:
         check_size(path, sum(m.file_size for m in archive.infolist()), "its arrays hold")
-    return array_tables(path, [s for name in found.files for s in series_in(name, found[name])])
+    return array_tables(path, [s for name in content.files for s in series_in(name, content[name])])
 
 
 def universal_tables(path: str) -> list[Table]:
     """Return the tables of a universal file (UFF, data set 58, text or binary)."""
     import pyuff  # noqa: PLC0415
 
-    found: list[Series] = []
+    series: list[Series] = []
     stated: list[str] = []
     for k, one in enumerate(pyuff.UFF(path).read_sets() or []):
         if one.get("type") != 58:
@@ -439,12 +441,12 @@ def universal_tables(path: str) -> list[Table]:
         name = str(one.get("id1") or "").strip()
         name = name if name and name.upper() != "NONE" else f"channel {k + 1}"
         unit = str(one.get("ordinate_axis_units_lab") or "").strip()
-        found += series_in(name, np.real(one["data"]), unit)
+        series += series_in(name, np.real(one["data"]), unit)
         if one.get("abscissa_spacing") == 1:
             stated += statements({"dt": one["abscissa_inc"]})
         elif not stated:
-            found += series_in("time", np.asarray(one["x"]), "s")
-    return array_tables(path, found, stated)
+            series += series_in("time", np.asarray(one["x"]), "s")
+    return array_tables(path, series, stated)
 
 
 #: What reads a file, by its ending, the package that it needs, and what messages call it.

@@ -73,10 +73,10 @@ def joined(
     held = [(path, *_channels(path, tables)) for path, tables, _ in files]
     clocks = _clocks([(path, cells, unit) for path, cells, unit, _ in held])
     channels, resampled = [], []
-    for (path, _, _, own), time in zip(held, clocks, strict=True):
-        if alone and len(own) != 1:
-            raise InputError(f"{path}: holds {len(own)} channels beside the time, expected one.")
-        channels += [(path, name, unit, time, values) for name, unit, values in own]
+    for (path, _, _, item), time in zip(held, clocks, strict=True):
+        if alone and len(item) != 1:
+            raise InputError(f"{path}: holds {len(item)} channels beside the time, expected one.")
+        channels += [(path, name, unit, time, values) for name, unit, values in item]
     first = clocks[0]
     shared = (first >= max(t[0] for t in clocks)) & (first <= min(t[-1] for t in clocks))
     if shared.sum() < FEWEST_SAMPLES:
@@ -85,15 +85,15 @@ def joined(
             f" {clocks[0][0]:.9g} and {clocks[1][0]:.9g} s); let both begin with the record."
         )
     names = [name for _, name, *_ in channels]
-    found = [Series("time", int(shared.sum()), lambda: first[shared], "s")]
+    items = [Series("time", int(shared.sum()), lambda: first[shared], "s")]
     for path, name, unit, time, values in channels:
         label = f"{Path(path).stem}.{name}" if names.count(name) > 1 else name
         same = np.array_equal(time, first)
         resampled += [] if same else [Path(path).name]
         kept = (values if same else np.interp(first, time, values))[shared]
-        found.append(Series(label, kept.size, partial(np.asarray, kept), unit))
+        items.append(Series(label, kept.size, partial(np.asarray, kept), unit))
     together = "+".join(path for path, *_ in files)
-    outcome = samples_of(together, array_tables(together, found)[:1], request)
+    outcome = samples_of(together, array_tables(together, items)[:1], request)
     outcome.notes += (f"the channels of {len(files)} files are one record.",)
     if resampled:
         outcome.notes += (
@@ -110,10 +110,10 @@ def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
     Dates and clock times are counted from the first of all files together.
     """
     texts = [[str(cell) for cell in cells] for _, cells, _ in times]
-    are_stamps = [is_stamp(own[0]) for own in texts]
-    together = seconds_of([cell for own in texts for cell in own]) if all(are_stamps) else None
+    are_stamps = [is_stamp(item[0]) for item in texts]
+    together = seconds_of([cell for item in texts for cell in item]) if all(are_stamps) else None
     if together is not None:
-        return np.split(together, np.cumsum([len(own) for own in texts])[:-1])
+        return np.split(together, np.cumsum([len(item) for item in texts])[:-1])
     if any(are_stamps):
         named = ", ".join(path for path, *_ in times)
         raise InputError(f"{named}: some have dates or clock times, others numbers; give all one.")
@@ -134,7 +134,7 @@ def _channels(
     units = [stated_unit(text) for text in table.header]
     rows = zip(table.labels, units, columns.cells, strict=True)
     channels = [
-        (label, unit, as_numbers(own)) for k, (label, unit, own) in enumerate(rows) if k != at
+        (label, unit, as_numbers(item)) for k, (label, unit, item) in enumerate(rows) if k != at
     ]
     channels = [channel for channel in channels if np.isfinite(channel[-1]).any()]
     return columns.cells[at], units[at] or "s", channels
@@ -178,7 +178,7 @@ def write_record(path: str | os.PathLike[str], columns: Record | Mapping[str, Ar
                 f"column one value for each instant."
             )
     problems.raise_if_any()
-    cells = [["" if math.isnan(v) else repr(v) for v in own.tolist()] for own in arrays.values()]
+    cells = [["" if math.isnan(v) else repr(v) for v in item.tolist()] for item in arrays.values()]
     atomic_write(path, "\n".join([",".join(arrays), *map(",".join, zip(*cells, strict=True)), ""]))
 
 
@@ -304,19 +304,19 @@ def _several(
     problems: list[str] = []
     failed = 0
     for path in places:
-        own = _said_of(request, wanted, Path(path).name)
+        item = _said_of(request, wanted, Path(path).name)
         try:
-            each = [own.table]
-            if own.table == ALL:
-                each = [*_read(path, replace(own, table="")).tables] or [""]
-            records += [make(path, _read(path, replace(own, table=t)), table=t) for t in each]
+            each = [item.table]
+            if item.table == ALL:
+                each = [*_read(path, replace(item, table="")).tables] or [""]
+            records += [make(path, _read(path, replace(item, table=t)), table=t) for t in each]
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
     if failed == len(places) > 1:  # they may hold a channel each
-        own, outcome = _said_of(request, wanted, ""), None
+        item, outcome = _said_of(request, wanted, ""), None
         with suppress(InputError):
-            outcome = joined([(p, *apart.text_of(p)) for p in places], own, alone=True)
+            outcome = joined([(p, *apart.text_of(p)) for p in places], item, alone=True)
         if outcome is not None:
             return [make("+".join(places), outcome)]
     if not places:
@@ -349,13 +349,13 @@ def record_from(
 
 def _in_memory(table: TableLike, name: str, request: Request) -> Outcome:
     """Return the samples of a table in memory, with a hash of them."""
-    own = list(table if isinstance(table, Mapping) else table.columns)
+    items = list(table if isinstance(table, Mapping) else table.columns)
 
-    def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
-        cells = [_cells(name, own[k], table[own[k]], problems)[:most] for k in asked]
+    def load(numbers: Sequence[int], most: int | None, problems: Problems) -> Columns:
+        cells = [_cells(name, items[k], table[items[k]], problems)[:most] for k in numbers]
         return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
-    header = [str(text) for text in own]
+    header = [str(text) for text in items]
     labels = [name_and_unit(text)[0] for text in header]
     held = Table(name, "", header, labels, f"{name}: column names", "row", load)
     outcome = samples_of(name, [held], request)
@@ -366,7 +366,7 @@ def _in_memory(table: TableLike, name: str, request: Request) -> Outcome:
     return outcome
 
 
-def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
+def _cells(name: str, item: object, column: Any, problems: Problems) -> npt.NDArray[Any]:
     """Return a column in memory as numbers or instants."""
     values = np.asarray(column)
     if values.dtype.kind not in "mM":
@@ -374,23 +374,23 @@ def _cells(name: str, own: object, column: Any, problems: Problems) -> npt.NDArr
             values = np.asarray(column, dtype=np.float64)
         except (TypeError, ValueError):
             problems.add(
-                f"{name}: column '{own}': holds {type(column).__name__} that is not all"
+                f"{name}: column '{item}': holds {type(column).__name__} that is not all"
                 " numbers; convert the column first."
             )
             return np.full(len(values) if values.ndim else 0, np.nan)
     if values.ndim != 1:
         problems.add(
-            f"{name}: column '{own}': has shape {values.shape}; give one value for each instant"
+            f"{name}: column '{item}': has shape {values.shape}; give one value for each instant"
         )
     return values.ravel()
 
 
 def _said_of(request: Request, columns: str | ColumnMap | None, file: str) -> Request:
     """Return what is wanted of a file, with what `columns` say of this one."""
-    told = parse_columns(columns, request.names) if isinstance(columns, str) else columns or {}
-    own = dict(columns_of(told, file))
-    chosen = own.pop(TABLE, Source("", None)).array
-    return replace(request, columns=own, table=chosen)
+    output = parse_columns(columns, request.names) if isinstance(columns, str) else columns or {}
+    item = dict(columns_of(output, file))
+    chosen = item.pop(TABLE, Source("", None)).array
+    return replace(request, columns=item, table=chosen)
 
 
 def _read(path: str, request: Request) -> Outcome:
@@ -400,23 +400,25 @@ def _read(path: str, request: Request) -> Outcome:
     return joined([(part, *apart.text_of(part)) for part in parts], request)
 
 
-def records_given(given: Records) -> tuple[Record, ...]:
+def records_given(records: Records) -> tuple[Record, ...]:
     """Return what was given as records: one or several records, paths of files, tables.
 
     Raises:
         InputError: the mistakes of all of them together.
     """
 
-    def one(given: Any, name: str) -> Record:
-        if isinstance(given, Signals):
-            return given if isinstance(given, Record) else record_from(_table(given), name=name)
-        return read_record(given) if _is_path(given) else record_from(given, name=name)
+    def one(records: Any, name: str) -> Record:
+        if isinstance(records, Signals):
+            return (
+                records if isinstance(records, Record) else record_from(_table(records), name=name)
+            )
+        return read_record(records) if _is_path(records) else record_from(records, name=name)
 
-    return tuple(_each(given, one, 1, "'voltage [V]': v"))
+    return tuple(_each(records, one, 1, "'voltage [V]': v"))
 
 
 def signals_given(
-    given: Any,
+    arguments: Any,
     inputs: Sequence[str],
     outputs: Sequence[str],
     *,
@@ -433,26 +435,26 @@ def signals_given(
     """
     request = _request_of(inputs, outputs)
 
-    def one(given: Any, name: str) -> Signals:
-        if isinstance(given, Signals):
-            return Signals(**{f.name: getattr(given, f.name) for f in fields(Signals)})
-        if _is_path(given):
-            return _signals(str(given), _read(str(given), request))
-        return _signals(name, _in_memory(given, name, request), source="")
+    def one(arguments: Any, name: str) -> Signals:
+        if isinstance(arguments, Signals):
+            return Signals(**{f.name: getattr(arguments, f.name) for f in fields(Signals)})
+        if _is_path(arguments):
+            return _signals(str(arguments), _read(str(arguments), request))
+        return _signals(name, _in_memory(arguments, name, request), source="")
 
-    found = _each(given, one, first, f"'{(*inputs, *outputs)[0]}': u")
-    if not found:
+    result = _each(arguments, one, first, f"'{(*inputs, *outputs)[0]}': u")
+    if not result:
         raise InputError("There are no records; give one or more.")
-    return found if hold is None else [replace(s, hold=hold) for s in found]
+    return result if hold is None else [replace(s, hold=hold) for s in result]
 
 
-def _each(given: Any, one: Callable[[Any, str], _Made], first: int, example: str) -> list[_Made]:
+def _each(items: Any, one: Callable[[Any, str], _Made], first: int, example: str) -> list[_Made]:
     """Return what `one` makes of every record that was given, with a name where it has none."""
-    is_one = isinstance(given, Signals) or _is_path(given) or _is_table(given)
-    if not is_one and not isinstance(given, Iterable):
-        given = [given]
-    several = [given] if is_one else list(given)
-    found: list[_Made] = []
+    is_one = isinstance(items, Signals) or _is_path(items) or _is_table(items)
+    if not is_one and not isinstance(items, Iterable):
+        items = [items]
+    several = [items] if is_one else list(items)
+    result: list[_Made] = []
     problems: list[str] = []
     for k, each in enumerate(several, first):
         if not (isinstance(each, Signals) or _is_path(each) or _is_table(each)):
@@ -462,16 +464,16 @@ def _each(given: Any, one: Callable[[Any, str], _Made], first: int, example: str
             )
             continue
         try:
-            found.append(one(each, f"record {k}" if several[1:] or first > 1 else "record"))
+            result.append(one(each, f"record {k}" if several[1:] or first > 1 else "record"))
         except InputError as error:
             problems.extend(error.problems)
     if problems:
         raise InputError(problems)
-    return found
+    return result
 
 
-def _is_path(given: object) -> TypeGuard[AnyPath]:
-    return isinstance(given, str | os.PathLike)
+def _is_path(inputs: object) -> TypeGuard[AnyPath]:
+    return isinstance(inputs, str | os.PathLike)
 
 
 def _table(signals: Signals) -> dict[str, Any]:
@@ -479,8 +481,8 @@ def _table(signals: Signals) -> dict[str, Any]:
     return with_units({"time": signals.time, **signals.columns}, {"time": "s", **signals.units})
 
 
-def _is_table(given: object) -> TypeGuard[TableLike]:
-    return isinstance(given, Mapping) or hasattr(given, "columns")
+def _is_table(inputs: object) -> TypeGuard[TableLike]:
+    return isinstance(inputs, Mapping) or hasattr(inputs, "columns")
 
 
 def _record(path: str, outcome: Outcome, *, source: str | None = None, table: str = "") -> Record:

@@ -125,25 +125,27 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     is_part = tables[0] in parts.values()
     if len(tables) == 1 or whole.tables or (not is_part and (whole.is_read or request.columns)):
         return whole  # of arrays all together are one record
-    found = {key: _of_one(table, request, "") for key, table in parts.items()}
-    return _of_several(path, found) if is_part or any(o.is_read for o in found.values()) else whole
+    result = {key: _of_one(table, request, "") for key, table in parts.items()}
+    return (
+        _of_several(path, result) if is_part or any(o.is_read for o in result.values()) else whole
+    )
 
 
-def _of_several(path: str, found: Mapping[str, Outcome]) -> Outcome:
+def _of_several(path: str, outcomes: Mapping[str, Outcome]) -> Outcome:
     """Return the samples of the only record among several tables, or list those that can be one."""
-    read = [key for key, outcome in found.items() if outcome.is_read]
+    read = [key for key, outcome in outcomes.items() if outcome.is_read]
     if len(read) == 1:
-        note = f"of {len(found)} tables '{read[0]}' is read, the only one that is a record."
-        found[read[0]].notes += (note,)
-        return found[read[0]]
-    some = read or [key for key, outcome in found.items() if outcome.offer] or list(found)
+        note = f"of {len(outcomes)} tables '{read[0]}' is read, the only one that is a record."
+        outcomes[read[0]].notes += (note,)
+        return outcomes[read[0]]
+    some = read or [key for key, outcome in outcomes.items() if outcome.offer] or list(outcomes)
     if len(some) == 1:
-        return found[some[0]]
+        return outcomes[some[0]]
     listed = quoted(some[:MOST_NAMED])
     more = f" and {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
     problem = (
         f"{path}: holds {len(some)} tables that may be the record ({listed}{more}); take one of"
-        f" them, such as {ready_line(*(found[some[0]].offer or ({}, None)), some[0])}"
+        f" them, such as {ready_line(*(outcomes[some[0]].offer or ({}, None)), some[0])}"
         f"{f', or each as a record: {ready_line({}, None, ALL)}' if read else ''}."
     )
     return Outcome((problem,), tables=tuple(some))
@@ -154,17 +156,17 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     tried = _Try(table, request, segment)
     if not tried.open:
         return tried.outcome
-    said = [f"{q.what}; {q.cure}" if q.cure else q.what for q in tried.open]
+    items = [f"{q.what}; {q.cure}" if q.cure else q.what for q in tried.open]
     offer, key = _offer(table, request, tried.choice, segment)
     if offer:
         last = tried.open[-1]
         how = last.ask if offer[0] else "give the time between samples"
         join = ", or" if last.cure else ";"
-        said[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
+        items[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
     elif len(table.header) == 2 and not table.sizes:
-        said[-1] += "; files of one channel each are joined as FILE+FILE"
+        items[-1] += "; files of one channel each are joined as FILE+FILE"
     whole = Problems()
-    for sentence in (*(f"{s}." for s in said), *tried.problems.sentences()):
+    for sentence in (*(f"{s}." for s in items), *tried.problems.sentences()):
         whole.add(sentence)
     return replace(tried.outcome, problems=whole.sentences(), offer=offer)
 
@@ -173,23 +175,23 @@ def _offer(
     table: Table, request: Request, choice: Choice | ByName, segment: str
 ) -> tuple[tuple[ColumnMap, float | None] | None, str]:
     """Return the first options with which the table is read, and the part of it that they take."""
-    given = request.sample_time
+    inputs = request.sample_time
     without = {name: source for name, source in choice.sources.items() if name != "time"}
     trials: list[tuple[ColumnMap, float | None]] = []
     if choice.sources:
-        trials = [(choice.sources, given), (without, given or _EXAMPLE_STEP)]
-    if given is None:
+        trials = [(choice.sources, inputs), (without, inputs or _EXAMPLE_STEP)]
+    if inputs is None:
         trials.append((request.columns, _EXAMPLE_STEP))
     for sources, step in trials:
         trial = replace(request, columns=sources, sample_time=step)
-        offer = (sources if sources != request.columns else {}, step if given is None else None)
-        found = _Try(table, trial, segment)
-        if found.open:
+        offer = (sources if sources != request.columns else {}, step if inputs is None else None)
+        result = _Try(table, trial, segment)
+        if result.open:
             continue
-        if found.outcome.is_read:
+        if result.outcome.is_read:
             return offer, ""
-        if found.outcome.tables and _Try(table, trial, "1").outcome.is_read:
-            return offer, found.outcome.tables[0]
+        if result.outcome.tables and _Try(table, trial, "1").outcome.is_read:
+            return offer, result.outcome.tables[0]
     return None, ""
 
 
@@ -225,24 +227,24 @@ class _Try:
             return
         texts = [cells for cells in columns.cells if not isinstance(cells, np.ndarray)]
         point = decimal_sign(c for row in zip(*texts, strict=False) for c in row)
-        found = {
-            name: self._numbers(name, own.unit, cells, columns.lines, point)
-            for (name, own), cells in zip(fields.items(), columns.cells, strict=True)
+        result = {
+            name: self._numbers(name, item.unit, cells, columns.lines, point)
+            for (name, item), cells in zip(fields.items(), columns.cells, strict=True)
         }
-        units = {name: own.unit for name, own in fields.items()}
+        units = {name: item.unit for name, item in fields.items()}
         if step is not None:
             units = {"time": "s", **units}
-            found = {"time": self._even_time(step, columns.lines), **found}
-        elif "time" in found:
-            part = self._timed(found)
+            result = {"time": self._even_time(step, columns.lines), **result}
+        elif "time" in result:
+            part = self._timed(result)
             if part is None:
                 return
-            found = {n: c.part(part) for n, c in found.items()}
-        check_size(table.path, 8 * len(columns.lines) * len(found), "its columns hold")
-        self._check(found)
+            result = {n: c.part(part) for n, c in result.items()}
+        check_size(table.path, 8 * len(columns.lines) * len(result), "its columns hold")
+        self._check(result)
         scales = {n: source.scale for n, source in request.columns.items() if source.scale}
         self.outcome.values = np.column_stack(
-            [c.values * scales[n] if n in scales else c.values for n, c in found.items()]
+            [c.values * scales[n] if n in scales else c.values for n, c in result.items()]
         )
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
         self.outcome.unread = self.choice.unread
@@ -263,8 +265,8 @@ class _Try:
         self, name: str, values: FloatArray, lines: IndexArray,
         wrong: BoolArray | None = None,
     ) -> Located:  # fmt: skip
-        told = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
-        return Located(self.table.path, name, values, lines, told, self.table.place)
+        output = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
+        return Located(self.table.path, name, values, lines, output, self.table.place)
 
     def _numbers(
         self, name: str, unit: str, cells: Cells, lines: IndexArray, point: str
@@ -297,13 +299,13 @@ class _Try:
             )
         return self._located(name, values, lines, wrong)
 
-    def _timed(self, found: Mapping[str, Located]) -> slice | None:
+    def _timed(self, locateds: Mapping[str, Located]) -> slice | None:
         """Return the part of the samples that is the record; mend a time with too few digits.
 
         None where the time begins anew: each part is a record, or packets have no time of their
         own.
         """
-        table, time, lines = self.table, found["time"].values, found["time"].lines
+        table, time, lines = self.table, locateds["time"].values, locateds["time"].lines
         starts = starts_of(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
         ends = [*starts[1:].tolist(), time.size]
         sizes = np.diff([*starts, time.size])
@@ -329,16 +331,16 @@ class _Try:
             part = slice(int(starts[k]), ends[k])
         elif len(starts) > 2 and len(set(sizes[:-1].tolist())) == 1 and np.isfinite(time).all():
             if np.array_equal(time[: sizes[0]], time[sizes[0] : 2 * sizes[0]]):
-                told = (
+                text = (
                     f"{table.path}: the time begins anew every {sizes[0]} {table.place}s: these"
                     " packets have no time of their own"
                 )
-                self.open.append(Question(told, ASK_UNIT))
+                self.open.append(Question(text, ASK_UNIT))
                 return None
         elif self.segment not in ("", "1"):
             raise InputError(f"{table.path}: there is no table '{self.segment}'; it holds one.")
         same = np.diff(time[part]) == 0.0
-        others = [np.diff(c.values[part])[same] for n, c in found.items() if n != "time"]
+        others = [np.diff(c.values[part])[same] for n, c in locateds.items() if n != "time"]
         repeats = same.any() and all((moves == 0.0).all() for moves in others)
         even = None if repeats else evened(time[part])  # lines that are double are not rounded
         if even is not None:
@@ -352,30 +354,30 @@ class _Try:
     def _lengths_differ(self, fields: Mapping[str, Field], columns: Columns) -> bool:
         sizes = [len(cells) for cells in columns.cells]
         first, kind = next(iter(fields), ""), "array" if self.table.sizes else "column"
-        for (name, own), size in zip(fields.items(), sizes, strict=True):
+        for (name, item), size in zip(fields.items(), sizes, strict=True):
             if size != sizes[0]:
                 self.problems.add(
-                    f"{self.table.path}: {kind} '{self.table.labels[own.index]}' ({name}) has"
+                    f"{self.table.path}: {kind} '{self.table.labels[item.index]}' ({name}) has"
                     f" {size} values, '{first}' has {sizes[0]}; give every column one value for"
                     " each instant."
                 )
         return len(set(sizes)) != 1
 
-    def _check(self, found: Mapping[str, Located]) -> None:
+    def _check(self, locateds: Mapping[str, Located]) -> None:
         """Check the samples of a record; those of a path to follow are checked elsewhere."""
         outputs = [n for n in self.request.names if n not in self.request.whole]
         for output in outputs or ["displacement"]:
-            missing = found.get(output)
+            missing = locateds.get(output)
             count = int((np.isnan(missing.values) & ~missing.reported).sum()) if missing else 0
             if count:
                 column = f"'{output}'" if outputs else "the displacement"
                 self.notes.append(f"{count} readings of {column} are missing; they are masked.")
         if not self.request.names and "voltage" not in self.request.needed:
             return
-        check_length(self.table.path, len(next(iter(found.values())).lines), self.problems)
+        check_length(self.table.path, len(next(iter(locateds.values())).lines), self.problems)
         checks: dict[str, Check] = {"time": check_time, "displacement": check_displacement}
         checks |= dict.fromkeys(outputs, check_finite)
-        for name, located in found.items():
+        for name, located in locateds.items():
             checks.get(name, check_complete)(located, self.problems)
             if name == "voltage" and self.request.excitation and not located.reported.any():
                 check_excitation(located, self.problems)

@@ -64,16 +64,16 @@ class Table:
     @cached_property
     def glance(self) -> Sequence[Cells]:
         """The first rows of all columns."""
-        found = self.load(range(len(self.header)), GLANCE, Problems())
-        return [cells[:GLANCE] for cells in found.cells]
+        content = self.load(range(len(self.header)), GLANCE, Problems())
+        return [cells[:GLANCE] for cells in content.cells]
 
     def part(self, name: str, columns: Sequence[int]) -> "Table":
         """Return the table of some of the columns."""
 
-        def load(asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
-            return self.load([columns[k] for k in asked], most, problems)
+        def load(numbers: Sequence[int], most: int | None, problems: Problems) -> Columns:
+            return self.load([columns[k] for k in numbers], most, problems)
 
-        header, labels = ([own[k] for k in columns] for own in (self.header, self.labels))
+        header, labels = ([item[k] for k in columns] for item in (self.header, self.labels))
         sizes = [self.sizes[k] for k in columns] if self.sizes else ()
         return replace(self, name=name, header=header, labels=labels, sizes=sizes, load=load)
 
@@ -164,9 +164,9 @@ def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray,
         if "_" not in "".join(cells):
             return without_overload(values), np.zeros(values.size, dtype=np.bool_)
     known = {cell: _number(cell, point, unit) for cell in set(cells)}
-    found = [known[cell] for cell in cells]
-    numbers = np.array([math.nan if v is None else v for v in found])
-    return without_overload(numbers), np.array([v is None for v in found], dtype=np.bool_)
+    items = [known[cell] for cell in cells]
+    numbers = np.array([math.nan if v is None else v for v in items])
+    return without_overload(numbers), np.array([v is None for v in items], dtype=np.bool_)
 
 
 def as_numbers(cells: Cells, unit: str = "") -> FloatArray:
@@ -188,12 +188,12 @@ def _number(cell: str, point: str, unit: str) -> float | None:
         return None if "_" in text else float(plain)
     except ValueError:
         match = _WITH_UNIT.fullmatch(text)
-    own = unit_named(match["unit"], common=False) if match else None
-    value = _number(match["number"], point, unit) if match and own else None
-    if value is None or own is None:
+    item = unit_named(match["unit"], common=False) if match else None
+    value = _number(match["number"], point, unit) if match and item else None
+    if value is None or item is None:
         return None
     try:
-        one, other = parse_unit(own), parse_unit(unit)
+        one, other = parse_unit(item), parse_unit(unit)
     except InputError:
         return None
     if one == other:
@@ -220,8 +220,8 @@ _EPOCHS = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 
 def is_stamp(cell: str) -> bool:
     """Whether a text is a date, a clock time or both."""
-    found = _STAMP.fullmatch(cell.strip().strip('"'))
-    return found is not None and (found["h"] is not None or found["a"] is not None)
+    result = _STAMP.fullmatch(cell.strip().strip('"'))
+    return result is not None and (result["h"] is not None or result["a"] is not None)
 
 
 def unit_of_times(times: FloatArray) -> str | None:
@@ -245,10 +245,10 @@ def seconds_of(cells: Sequence[str]) -> FloatArray | None:
     Of 3/4/2024 the day is what makes the record the shorter one; a clock that goes back by more
     than half a day has passed midnight.
     """
-    found = [_STAMP.fullmatch(cell.strip().strip('"')) for cell in cells]
-    if not found or any(m is None or (m["h"] is None and m["a"] is None) for m in found):
+    items = [_STAMP.fullmatch(cell.strip().strip('"')) for cell in cells]
+    if not items or any(m is None or (m["h"] is None and m["a"] is None) for m in items):
         return None
-    stamps = [m for m in found if m is not None]
+    stamps = [m for m in items if m is not None]
     exact = [_clock(m) for m in stamps]
     clock = np.array([float(t - exact[0]) for t in exact])
     if stamps[0]["a"] is None:

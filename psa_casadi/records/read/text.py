@@ -112,20 +112,20 @@ def _with_header(lines: Sequence[str], place: int, mark: str) -> Layout:
 
 def further_layouts(lines: Sequence[str], mark: str, first: Layout) -> Iterator[Layout]:
     """Yield the layouts of the headers below the first one."""
-    asked, begin = 0, first.first
+    requested, begin = 0, first.first
     if not first.header:
         return
     for k in range(first.first + 1, len(lines)):
         if k < begin or not WORDY.match(lines[k]):
             continue
-        asked += 1
-        if asked > _MOST_HEADERS:
+        requested += 1
+        if requested > _MOST_HEADERS:
             return
         if _named(lines, [k], mark, sure=True) is not None:
-            found = _with_header(lines, k, mark)
-            if found.delimiter == first.delimiter:
-                begin = found.first
-                yield found
+            layout = _with_header(lines, k, mark)
+            if layout.delimiter == first.delimiter:
+                begin = layout.first
+                yield layout
 
 
 def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
@@ -170,15 +170,15 @@ def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
     """Return the line of names, and of units below it, above the first numbers, else the first."""
     places = range(start, min(len(lines), _MOST_LINES))
     first = next((k for k in places if _numbers(lines[k], mark)), start)
-    told = mark or _numbers(lines[first], mark).strip(" ")
+    output = mark or _numbers(lines[first], mark).strip(" ")
     cells = [
-        cells_of(line, told if told and told in line else delimiter_of(line))
+        cells_of(line, output if output and output in line else delimiter_of(line))
         for line in lines[max(start, first - 2) : first + 1]
     ]
     if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
         return first - 2
-    alike = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
-    return first - 1 if alike and not is_number(cells[-2][0]) else start
+    similar = len(cells) > 1 and len(cells[-2]) == len(cells[-1])
+    return first - 1 if similar and not is_number(cells[-2][0]) else start
 
 
 def _named(
@@ -221,9 +221,9 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
         InputError: the head of an instrument's file is damaged.
     """
     lines, header, step = instrument_lines(path, lines) if place == "line" else (lines, (), None)
-    told = _TOLD_MARK.fullmatch(lines[0]) if lines else None
-    mark = told[1] if told else ""
-    lines = ["", *lines[1:]] if told else lines
+    output = _TOLD_MARK.fullmatch(lines[0]) if lines else None
+    mark = output[1] if output else ""
+    lines = ["", *lines[1:]] if output else lines
     first = _in_rows(lines, mark) or laid_out(lines, mark)
     if header:
         first = Layout(header, delimiter_of(next(filter(holds, lines), "")), 0, 0)
@@ -231,13 +231,13 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
         return []
     if isinstance(first, Table):
         return [replace(first, path=path, where=f"{path}: {place} 1", name=name)]
-    found = [first, *further_layouts(lines, mark, first)]
-    ends = [*(layout.header_line for layout in found[1:]), len(lines)]
+    items = [first, *further_layouts(lines, mark, first)]
+    ends = [*(layout.header_line for layout in items[1:]), len(lines)]
     step = step or stated_step(lines[: first.first])
     tables: list[Table] = []
-    for layout, stop in zip(found, ends, strict=True):
+    for layout, stop in zip(items, ends, strict=True):
         end = stop
-        if len(found) > 1 and stop - layout.first < FEWEST_SAMPLES:
+        if len(items) > 1 and stop - layout.first < FEWEST_SAMPLES:
             continue
         while layout.first < end < len(lines):  # above the preamble of the next one
             cells = cells_of(lines[end - 1], layout.delimiter)
@@ -284,22 +284,22 @@ class _Part:
         )  # fmt: skip
         if not layout.header:
             numbered = tuple(str(k) for k in range(1, width + 1))
-            told = ",".join(self._cells(first))
-            return replace(bare, header=numbered, labels=numbered, headless=told)
+            output = ",".join(self._cells(first))
+            return replace(bare, header=numbered, labels=numbered, headless=output)
         header = [_with_unit(h, c) for h, c in zip(layout.header, bare.glance, strict=True)]
         return replace(bare, header=header, labels=[name_and_unit(text)[0] for text in header])
 
     def _cells(self, row: str) -> list[str]:
         return cells_of(row, self.layout.delimiter)
 
-    def _load(self, asked: Sequence[int], most: int | None, problems: Problems) -> Columns:
+    def _load(self, numbers: Sequence[int], most: int | None, problems: Problems) -> Columns:
         kept = self._kept
         rows = [self.rows[k] for k in kept[:most]]
         lines = np.asarray(kept[:most], dtype=np.int64) + self.layout.first + 1
-        quick = self._at_once(rows, asked)
+        quick = self._at_once(rows, numbers)
         if quick is not None:
-            return Columns([quick[:, k] for k in range(len(asked))], lines)
-        width = max(len(self.layout.header), max(asked, default=0) + 1)
+            return Columns([quick[:, k] for k in range(len(numbers))], lines)
+        width = max(len(self.layout.header), max(numbers, default=0) + 1)
         split, whole = [], []
         for line, row in zip(lines, rows, strict=True):
             cells = self._cells(row)
@@ -307,7 +307,7 @@ class _Part:
                 cells = [*cells, *[""] * width][:width]
             spare = len(cells) - width
             if (spare > 0 and any(c.strip() for c in cells[width:])) or (
-                spare < 0 and len(cells) <= max(asked, default=0)
+                spare < 0 and len(cells) <= max(numbers, default=0)
             ):
                 hint = f"complete or remove the {self.place}"
                 if self.layout.delimiter == "," and len(cells) == 2 * width:
@@ -319,7 +319,7 @@ class _Part:
                 continue
             split.append(cells)
             whole.append(line)
-        columns = [[cells[k] for cells in split] for k in asked]
+        columns = [[cells[k] for cells in split] for k in numbers]
         return Columns(columns, np.array(whole, dtype=np.int64))
 
     @cached_property
@@ -338,7 +338,7 @@ class _Part:
             below += 1
         return kept[: len(kept) - below] if below < _MOST_BELOW else kept
 
-    def _at_once(self, rows: Sequence[str], asked: Sequence[int]) -> FloatArray | None:
+    def _at_once(self, rows: Sequence[str], numbers: Sequence[int]) -> FloatArray | None:
         """Let NumPy read all rows; None if any of them needs a closer look."""
         body, mark = "\n".join(rows), self.layout.delimiter
         point = decimal_sign([c for row in rows[:20] for c in self._cells(row)])
@@ -354,7 +354,7 @@ class _Part:
             rows = body.translate(SWAPPED).split("\n")
         del body  # of a long record it is as large as the rows
         try:
-            values = np.loadtxt(rows, delimiter=mark, comments=None, usecols=asked, ndmin=2)
+            values = np.loadtxt(rows, delimiter=mark, comments=None, usecols=numbers, ndmin=2)
         except ValueError:
             return None
         return None if np.any((np.abs(values) > 1e8) & np.isfinite(values)) else values
@@ -366,9 +366,9 @@ def _with_unit(text: str, cells: Cells) -> str:
     That is the second for dates and clock times, what stands behind the numbers, or what makes a
     number the time since 1970. In a cell in capitals the unit is written as it is: `TIME(S)`.
     """
-    own, unit = name_and_unit(text)
+    item, unit = name_and_unit(text)
     if unit is not None and unit_named(unit) == "s" and ":" in unit:
-        return f"{own} [s]"
+        return f"{item} [s]"
     capitals = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
     name = understood(capitals["name"]) if capitals else None
     if capitals and name and not measures(name.column, capitals["unit"]):
@@ -387,8 +387,8 @@ def _unit_below(text: str, cells: Cells) -> str | None:
         cells = [c for c in cells if c.strip()]
         if cells and is_stamp(cells[0]):
             return "s"
-        if own := unit_in(cells):
-            return own
+        if item := unit_in(cells):
+            return item
     name = understood(text)
     is_time = name is not None and name.column == "time"
     return unit_of_times(as_numbers(cells[:9], "s")) if is_time else None
@@ -408,9 +408,9 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
         return None
     header = [_with_unit(row[0], row[1:]) for row in cells]
 
-    def load(asked: Sequence[int], most: int | None, _: Problems) -> Columns:
+    def load(numbers: Sequence[int], most: int | None, _: Problems) -> Columns:
         end = width if most is None else min(width, most + 1)
-        return Columns([cells[k][1:end] for k in asked], np.arange(1, end))
+        return Columns([cells[k][1:end] for k in numbers], np.arange(1, end))
 
     return Table("", "", header, [name_and_unit(h)[0] for h in header], "", "sample", load)
 
@@ -482,7 +482,7 @@ def instrument_lines(path: str, lines: Sequence[str]) -> Form:
 
 def stated_step(lines: Sequence[str]) -> float | None:
     """Return the time between samples [s] that the lines above a table state, None without one."""
-    found = set()
+    result = set()
     for line in lines[:_MOST_LINES]:
         match = _STEP.fullmatch(line)
         if match is None or not match["name"].lower().lstrip("# ").startswith(_SAMPLES):
@@ -495,16 +495,18 @@ def stated_step(lines: Sequence[str]) -> float | None:
         except InputError:
             continue
         if 0.0 < value < 1e12:
-            found.add(1.0 / value if unit.endswith("Hz") or is_rate else value)
-    return found.pop() if len(found) == 1 else None
+            result.add(1.0 / value if unit.endswith("Hz") or is_rate else value)
+    return result.pop() if len(result) == 1 else None
 
 
 def _tektronix(lines: Sequence[str]) -> Form:
     """Return the time and the value of a channel, which stand beside the settings."""
     rows = [[cell.strip() for cell in line.split(",")] for line in lines]
-    told = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
-    unit, clock = (unit_named(told.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal"))
-    name = told.get("Source") or "value"
+    table = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
+    unit, clock = (
+        unit_named(table.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal")
+    )
+    name = table.get("Source") or "value"
     header = (f"time [{clock or 's'}]", f"{name} [{unit}]" if unit else name)
     return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header, None
 
@@ -568,8 +570,8 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
 
 
 def _entries(lines: Sequence[str], mark: str) -> dict[str, list[str]]:
-    found = [[cell.strip() for cell in re.split(mark, line)] for line in lines]
-    return {key: values or [""] for key, *values in found}
+    items = [[cell.strip() for cell in re.split(mark, line)] for line in lines]
+    return {key: values or [""] for key, *values in items}
 
 
 def _labview_names(cells: Sequence[str], units: Sequence[str]) -> str:

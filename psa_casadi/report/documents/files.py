@@ -117,15 +117,15 @@ class DeviceFile:
     sha256: tuple[str, ...] = ()
 
 
-def damage(folder: Path, told: DeviceFile) -> str:
+def damage(folder: Path, device_file: DeviceFile) -> str:
     """Return what is wrong with the files in a device's folder; "" where they are as written."""
-    for name, sha256 in zip(told.files, told.sha256, strict=False):
+    for name, sha256 in zip(device_file.files, device_file.sha256, strict=False):
         path = folder / name
         try:
-            found = hash_of(path.read_bytes())
+            text = hash_of(path.read_bytes())
         except OSError as error:
             return f"{path}: cannot be read ({error.strerror}); run `psa batch` again."
-        if found != sha256:
+        if text != sha256:
             return f"{path}: is damaged, as it is not what was written; run `psa batch` again."
     return ""
 
@@ -140,8 +140,8 @@ class Told(Lined):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what this version does not know is left out."""
-        found: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
-        return found
+        table: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
+        return table
 
     def to_json(self) -> str:
         """Return the text of the file."""
@@ -427,30 +427,32 @@ class IdentificationFile:
 _MISSED = {"missed": "times", "output_missed": "ratio"}
 
 
-def identification_file(found: Identification, profiles: Iterable[Profile] = ()) -> dict[str, Any]:
+def identification_file(
+    identification: Identification, profiles: Iterable[Profile] = ()
+) -> dict[str, Any]:
     """Return what `--json` writes of an identification, of any model."""
-    intervals = found.model.provenance.intervals
+    intervals = identification.model.provenance.intervals
     parameters = {
         p.name: FoundParameter(
-            found.model.values[p.name],
+            identification.model.values[p.name],
             p.unit,
             (i.low, i.high) if (i := intervals.get(p.name)) is not None else None,
-            grade(found, p.name).degree,
+            grade(identification, p.name).degree,
             p.description,
         )
-        for p in found.model.structure.parameters
+        for p in identification.model.structure.parameters
     }
-    stack = found if isinstance(found, StackIdentification) else None
+    stack = identification if isinstance(identification, StackIdentification) else None
     records = []
-    for output in found.fit.channels:
+    for output in identification.fit.channels:
         j, channel = output.number, output.channel
         for k, part in zip(output.records, output.parts, strict=True):
             if channel.factors:
                 continue
-            e, sigma = found.experiments[k], found.fit.sigma[k]
+            e, sigma = identification.experiments[k], identification.fit.sigma[k]
             rms = float(np.sqrt(np.mean(part**2))) * e.share(j)
             if stack is None:
-                sigma = found.noise[channel.column] * e.share(j)
+                sigma = identification.noise[channel.column] * e.share(j)
             readings = e.measured(j)[e.at(j, e.record.mask)]
             share = 100.0 * rms / float(np.ptp(readings))
             records.append(
@@ -459,26 +461,26 @@ def identification_file(found: Identification, profiles: Iterable[Profile] = ())
                     channel.column, channel.unit,
                 )
             )  # fmt: skip
-    doubts = [d for d in found.doubts if isinstance(d, Note) and d.code in _MISSED]
-    missed = [float(d.values[_MISSED[d.code]]) for d in doubts]
+    doubts = [d for d in identification.doubts if isinstance(d, Note) and d.code in _MISSED]
+    items = [float(d.values[_MISSED[d.code]]) for d in doubts]
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
-        model=found.model.name,
+        model=identification.model.name,
         parameters=parameters,
-        rms_m=found.fit.rms,
-        converged=found.fit.converged,
-        interrupted=found.interrupted,
+        rms_m=identification.fit.rms,
+        converged=identification.fit.converged,
+        interrupted=identification.interrupted,
         records=tuple(records),
-        warnings=found.warnings,
-        notes=found.sentences,
+        warnings=identification.warnings,
+        notes=identification.sentences,
         advice=tuple(
             AdvisedRecord(a.sentence, a.parameters, a.repeats)
             for a in (stack.advice if stack else ())
         ),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
-        missed=max(missed, default=None),
-        noise_kinds=found.noise_kinds,
+        missed=max(items, default=None),
+        noise_kinds=identification.noise_kinds,
     )
     return asdict(content)
 
@@ -539,9 +541,9 @@ class PosteriorFile:
     notes: tuple[str, ...]
 
 
-def posterior_file(found: Posterior) -> dict[str, Any]:
+def posterior_file(posterior: Posterior) -> dict[str, Any]:
     """Return what `--json` writes of a posterior."""
-    task = found.task
+    task = posterior.task
     records = tuple(
         SampledRecord(
             e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
@@ -553,22 +555,22 @@ def posterior_file(found: Posterior) -> dict[str, Any]:
     parameters = {
         f.name: SampledParameter(
             f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
-            _finite(f.r_hat), _finite(f.prior_share), found.model.parameter(f.name).description,
+            _finite(f.r_hat), _finite(f.prior_share), posterior.model.parameter(f.name).description,
         )
-        for f in found.figures
+        for f in posterior.figures
     }  # fmt: skip
     content = PosteriorFile(
         format=POSTERIOR_FORMAT,
         package_version=__version__,
-        model=found.model.name,
+        model=posterior.model.name,
         parameters=parameters,
-        chains=found.chains,
-        draws=found.draws,
-        seed=found.seed,
-        divergences=found.divergences,
+        chains=posterior.chains,
+        draws=posterior.draws,
+        seed=posterior.seed,
+        divergences=posterior.divergences,
         records=records,
-        warnings=found.warnings,
-        notes=found.sentences,
+        warnings=posterior.warnings,
+        notes=posterior.sentences,
     )
     return asdict(content)
 
@@ -594,14 +596,14 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     """
     source = os.fspath(path)
     content = read_json(source, f"{_READ_ADVICE}.")
-    told, found = diagnosis_in(content, source)
-    if told is None:
-        raise InputError(f"{source}: its format is {shown(found)}, no diagnosis; {_READ_ADVICE}.")
-    return told
+    output, result = diagnosis_in(content, source)
+    if output is None:
+        raise InputError(f"{source}: its format is {shown(result)}, no diagnosis; {_READ_ADVICE}.")
+    return output
 
 
 def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFile | None, Any]:
     """Return the diagnosis that a file's content is, None if it is none, and its format."""
-    found = content.get("format") if isinstance(content, dict) else None
-    kind = DIAGNOSES.get(found) if isinstance(found, str) else None
-    return None if kind is None else decode(kind, content, source), found
+    result = content.get("format") if isinstance(content, dict) else None
+    kind = DIAGNOSES.get(result) if isinstance(result, str) else None
+    return None if kind is None else decode(kind, content, source), result

@@ -67,57 +67,63 @@ def read_findings(
     Raises:
         InputError: what cannot be read, all of it.
     """
-    found: list[_Read] = []
+    reads: list[_Read] = []
     problems: list[str] = []
     for path in paths:
         try:
-            found += _read(path, effects, traces)
+            reads += _read(path, effects, traces)
         except InputError as error:
             problems.extend(error.problems)
     if problems:
         raise InputError(problems)
-    return _named(_joined(found))
+    return _named(_joined(reads))
 
 
 def device_finding(
-    folder: Path, told: DeviceFile, effects: Sequence[Component] = (), *, traces: bool = False
+    folder: Path,
+    device_file: DeviceFile,
+    effects: Sequence[Component] = (),
+    *,
+    traces: bool = False,
 ) -> Finding:
     """Return the finding in a device's folder of `psa batch`; damage is an InputError."""
-    damaged = damage(folder, told)
+    damaged = damage(folder, device_file)
     if damaged:
         raise InputError(damaged)
-    (found,) = _joined([r for name in told.files for r in _read(folder / name, effects, traces)])
-    day = date.fromisoformat(told.date) if told.date else None
-    return replace(found[1], device=told.device, batch=told.batch, day=day)
+    (result,) = _joined(
+        [r for name in device_file.files for r in _read(folder / name, effects, traces)]
+    )
+    day = date.fromisoformat(device_file.date) if device_file.date else None
+    return replace(result[1], device=device_file.device, batch=device_file.batch, day=day)
 
 
 def _read(
-    given: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
+    inputs: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
-    if isinstance(given, AnyDiagnosisFile):
-        return [(Path(given.records[0].name), _diagnosis(given))]
-    if isinstance(given, Identification):
-        path, source = Path(given.experiments[0].record.name), "identification"
-        content = identification_file(given)
-    elif isinstance(given, Diagnosis):
-        path = Path(given.experiments[0].record.name)
-        content = given.to_dict()
+    if isinstance(inputs, AnyDiagnosisFile):
+        return [(Path(inputs.records[0].name), _diagnosis(inputs))]
+    if isinstance(inputs, Identification):
+        path, source = Path(inputs.experiments[0].record.name), "identification"
+        content = identification_file(inputs)
+    elif isinstance(inputs, Diagnosis):
+        path = Path(inputs.experiments[0].record.name)
+        content = inputs.to_dict()
         finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
-        return [(path, _with_model(finding, _model(given.model, traces)))]
+        return [(path, _with_model(finding, _model(inputs.model, traces)))]
     else:
-        path = Path(given) / DEVICE_FILE if Path(given).is_dir() else Path(given)
+        path = Path(inputs) / DEVICE_FILE if Path(inputs).is_dir() else Path(inputs)
         source = str(path)
         content = read_json(path, _ADVICE)
     diagnosis, kind = diagnosis_in(content, source)
     if diagnosis is not None:
         return [(path, _diagnosis(diagnosis))]
     if kind == DEVICE:
-        told = decode(DeviceFile, content, source)
-        if told.status != "done":
-            why = " ".join(told.problems)
-            raise InputError(f"{path}: the work on this device was {told.status}: {why}")
-        return [(path, device_finding(path.parent, told, effects, traces=traces))]
+        text = decode(DeviceFile, content, source)
+        if text.status != "done":
+            why = " ".join(text.problems)
+            raise InputError(f"{path}: the work on this device was {text.status}: {why}")
+        return [(path, device_finding(path.parent, text, effects, traces=traces))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
@@ -205,21 +211,21 @@ def _model(model: Model, traces: bool) -> Finding:
     )
 
 
-def _joined(found: Sequence[_Read]) -> list[_Read]:
+def _joined(reads: Sequence[_Read]) -> list[_Read]:
     """Join every model to the first finding of the same records that has none yet."""
-    rows = dict(enumerate(found))
+    rows = dict(enumerate(reads))
     full: set[int] = set()
-    for k, (_, own) in enumerate(found):
+    for k, (_, item) in enumerate(reads):
         same = [
             j
-            for j, (_, other) in enumerate(found)
-            if own.kind == "model" != other.kind and j not in full
-            if own.records and {s for _, s in own.records} == {s for _, s in other.records}
+            for j, (_, other) in enumerate(reads)
+            if item.kind == "model" != other.kind and j not in full
+            if item.records and {s for _, s in item.records} == {s for _, s in other.records}
         ]
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            rows[same[0]] = path, _with_model(finding, own)
+            rows[same[0]] = path, _with_model(finding, item)
             del rows[k]
     return list(rows.values())
 
@@ -234,43 +240,43 @@ def _with_model(finding: Finding, model: Finding) -> Finding:
     return replace(whole, force_scale=model.force_scale)
 
 
-def _named(found: Sequence[_Read]) -> tuple[Finding, ...]:
+def _named(reads: Sequence[_Read]) -> tuple[Finding, ...]:
     """Name findings by their device, else by the shortest end of their path that is their own.
 
     A file whose name says only what it is has that of its folder.
     """
     names, depth = [], 1
-    for path, finding in found:
+    for path, finding in reads:
         folder = path.resolve().parent.name
         plain = path.stem in _PLAIN_NAMES and folder
         names.append(finding.device or (folder if plain else path.stem))
-    while len(set(names)) < len(names) and depth < max(len(path.parts) for path, _ in found):
+    while len(set(names)) < len(names) and depth < max(len(path.parts) for path, _ in reads):
         depth += 1
         names = [
             name if names.count(name) == 1 else "/".join(path.with_suffix("").parts[-depth:])
-            for name, (path, _) in zip(names, found, strict=True)
+            for name, (path, _) in zip(names, reads, strict=True)
         ]
     counted: Counter[str] = Counter()
     out: list[Finding] = []
-    for name, (_, finding) in zip(names, found, strict=True):
+    for name, (_, finding) in zip(names, reads, strict=True):
         counted[name] += 1
-        own = name if counted[name] == 1 else f"{name} ({counted[name]})"
-        out.append(replace(finding, device=own))
+        item = name if counted[name] == 1 else f"{name} ({counted[name]})"
+        out.append(replace(finding, device=item))
     return tuple(out)
 
 
-def finding_content(found: Finding) -> dict[str, Any]:
+def finding_content(finding: Finding) -> dict[str, Any]:
     """Return a finding's main figures as one row of a table of devices."""
-    causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in found.causes)
-    row: dict[str, Any] = {"verdict": found.verdict, "cause": causes}
-    row["confidence"] = found.causes[0].confidence if found.causes else None
-    for e in found.errors or (None,):
+    causes = "; ".join(" or ".join((c.effect, *c.or_else)) for c in finding.causes)
+    row: dict[str, Any] = {"verdict": finding.verdict, "cause": causes}
+    row["confidence"] = finding.causes[0].confidence if finding.causes else None
+    for e in finding.errors or (None,):
         output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
         for name in ("base", "extended", "noise"):
             row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
-    row["rms [m]"], row["rms [% of range]"] = found.rms_m, found.rms_percent
-    row["missed [times the noise]"] = found.missed
-    for name, p in found.parameters.items():
+    row["rms [m]"], row["rms [% of range]"] = finding.rms_m, finding.rms_percent
+    row["missed [times the noise]"] = finding.missed
+    for name, p in finding.parameters.items():
         if p.told and p.interval is not None:
             row[f"{name} [{p.unit}]"] = p.value
             row[f"{name} low"], row[f"{name} high"] = p.interval

@@ -21,15 +21,15 @@ class Case:
 def check_cases(report: CheckReport) -> list[Case]:
     """Return every check of an FMU as a test."""
     table = check_table(report)
-    found = [dict(zip(table.head, row, strict=True)) for row in table.rows]
+    items = [dict(zip(table.head, row, strict=True)) for row in table.rows]
     texts = [
         f"found {row['found']}, allowed {row['allowed']}" if "found" in row else row["clause"]
-        for row in found
+        for row in items
     ]
     cases = []
-    for row, text, r in zip(found, texts, report.rows, strict=True):
-        said = ": ".join(filter(None, (text, row["remark"])))
-        cases.append(Case(row["check"], said, "" if r.passed else said))
+    for row, text, r in zip(items, texts, report.rows, strict=True):
+        statement = ": ".join(filter(None, (text, row["remark"])))
+        cases.append(Case(row["check"], statement, "" if r.passed else statement))
     return cases
 
 
@@ -49,8 +49,8 @@ def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float
     suites = ElementTree.Element("testsuites", counts)
     suite = ElementTree.SubElement(suites, "testsuite", {**counts, "skipped": "0"})
     for case in cases:
-        told = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
-        test = ElementTree.SubElement(suite, "testcase", told)
+        table = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
+        test = ElementTree.SubElement(suite, "testcase", table)
         if case.failure:
             failure = {"message": plain(case.failure), "type": "failure"}
             ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)

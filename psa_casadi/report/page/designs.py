@@ -76,45 +76,50 @@ def write_design_page(
 # Inputs
 
 
-def tracking_pictures(found: TrackedInput, uncompensated: FloatArray) -> list[Picture]:
+def tracking_pictures(tracked_input: TrackedInput, uncompensated: FloatArray) -> list[Picture]:
     """Return path and response, the error, and the voltage with its limits."""
-    target, x = found.target, found.response.displacement
+    target, x = tracked_input.target, tracked_input.response.displacement
     share = 100.0 / target.span
     paths = _path_and("designed, simulated", target, x)
     _curve(paths, target.time, 1e6 * uncompensated, "uncompensated, simulated", colours.BASE)
     errors = Panel("time [ms]", "error [% of range]", _HEIGHT)
     _curve(errors, target.time, share * (x - target.displacement), "simulated")
-    if found.by_program:
-        predicted = share * (found.predicted - target.displacement)
+    if tracked_input.by_program:
+        predicted = share * (tracked_input.predicted - target.displacement)
         _curve(errors, target.time, predicted, "predicted by the program", colours.BASE, 1.2)
     return [
         Picture("Path and response", paths),
         Picture("Error of the designed input", errors),
-        _voltage(found.response, found.limits),
+        _voltage(tracked_input.response, tracked_input.limits),
     ]
 
 
-def inversion_pictures(found: InvertedInput, limits: AmplifierLimits) -> list[Picture]:
+def inversion_pictures(inverted_input: InvertedInput, limits: AmplifierLimits) -> list[Picture]:
     """Return path and response of an inverted input, and the voltage with its limits."""
-    plot = _path_and("inverted, simulated", found.target, found.response.displacement)
-    return [Picture("Path and response", plot), _voltage(found.response, limits)]
+    plot = _path_and(
+        "inverted, simulated", inverted_input.target, inverted_input.response.displacement
+    )
+    return [Picture("Path and response", plot), _voltage(inverted_input.response, limits)]
 
 
-def trial_pictures(found: CorrectedInput) -> list[Picture]:
+def trial_pictures(corrected_input: CorrectedInput) -> list[Picture]:
     """Return path and measured trial, and the voltages played and corrected."""
-    plot = _path_and("trial, measured", found.target, found.measured)
-    return [Picture("Path and trial", plot), _voltage(found.response, found.limits, found.played)]
+    plot = _path_and("trial, measured", corrected_input.target, corrected_input.measured)
+    return [
+        Picture("Path and trial", plot),
+        _voltage(corrected_input.response, corrected_input.limits, corrected_input.played),
+    ]
 
 
-def move_pictures(found: QuickMove) -> list[Picture]:
+def move_pictures(quick_move: QuickMove) -> list[Picture]:
     """Return the displacement of a quickest move with its hold, and the voltage."""
-    plot = Panel("time [ms]", "displacement [µm]", _HEIGHT).across(1e6 * found.end)
-    r = found.response
+    plot = Panel("time [ms]", "displacement [µm]", _HEIGHT).across(1e6 * quick_move.end)
+    r = quick_move.response
     _curve(plot, r.time, 1e6 * r.displacement, "simulated", width=1.8)
     note = "Dashed: the position to reach. The voltage holds its last value behind the move."
-    pictures = [Picture("Move and hold", plot, note), _voltage(r, found.limits)]
+    pictures = [Picture("Move and hold", plot, note), _voltage(r, quick_move.limits)]
     for picture in pictures:
-        picture.panel.axes({"range": [0.0, _SHOWN * 1e3 * found.move_time]})
+        picture.panel.axes({"range": [0.0, _SHOWN * 1e3 * quick_move.move_time]})
     return pictures
 
 
@@ -168,8 +173,8 @@ def write_experiment_page(
     predicted = {r.name: r.predict(record, r.truth) for r in design.rivals}
     units = {o.name: o.unit for r in design.rivals for o in r.model.structure.outputs}
     for k, name in enumerate(design.rivals[0].outputs):
-        own = {n: y[:, k] for n, y in predicted.items()}
-        figures.append(_responses(record, own, name, units[name]))
+        table = {n: y[:, k] for n, y in predicted.items()}
+        figures.append(_responses(record, table, name, units[name]))
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
@@ -187,12 +192,12 @@ def _responses(
     """Return the plot of a predicted output, less the rivals' mean where there are several."""
     several = len(responses) > 1
     middle = np.mean(list(responses.values()), axis=0) if several else np.zeros(record.n)
-    shown = {n: y - middle for n, y in responses.items()}
-    largest = max(float(np.max(np.abs(y))) for y in shown.values())
+    table = {n: y - middle for n, y in responses.items()}
+    largest = max(float(np.max(np.abs(y))) for y in table.values())
     scale = length_scale(largest) if unit == "m" else prefixed_scale(largest, unit)
     name = output.removeprefix("measured_")
     plot = Panel("time [s]", in_brackets(name, scale.unit), 340)
-    for (rival, y), colour in zip(shown.items(), _COLOURS * len(shown), strict=False):
+    for (rival, y), colour in zip(table.items(), _COLOURS * len(table), strict=False):
         plot.line(record.time, scale.factor * y, plain(rival), colour)
     caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
     note = (
@@ -261,10 +266,10 @@ def _root_locus(d: MechanismDesign) -> Panel:
         (lag, "lag, cannot be moved", colours.INK, "square"),
     ):
         plot.marks(1e-3 * poles.real, 1e-3 * poles.imag, name, colour, 10, symbol)
-    shown = np.concatenate([d.free_poles, d.poles, lag])
-    shown = shown[np.abs(shown) < 4.0 * np.abs(d.free_poles).max()]
-    reach = 1.15e-3 * max(float(np.abs(shown.real).max()), float(np.abs(shown.imag).max()))
-    left = max(1.3e-3 * float(np.abs(shown.real).max()), 0.3 * reach)
+    displayed = np.concatenate([d.free_poles, d.poles, lag])
+    displayed = displayed[np.abs(displayed) < 4.0 * np.abs(d.free_poles).max()]
+    reach = 1.15e-3 * max(float(np.abs(displayed.real).max()), float(np.abs(displayed.imag).max()))
+    left = max(1.3e-3 * float(np.abs(displayed.real).max()), 0.3 * reach)
     ratio, edge = min(d.reached.damping, 1.0), np.array([0.0, reach])
     for sign, name in ((-1.0, ""), (1.0, f"damping ratio {number(ratio, 3)}")):
         height = sign * np.sqrt(1.0 - ratio**2) * edge

@@ -50,10 +50,10 @@ class Comparison:
     @property
     def tables(self) -> tuple[Table, ...]:
         """Verdicts with held-out errors of every output, and the parameters, if any are shared."""
-        found = [words.verdict_table(self.findings, words.error_scale(self.findings))]
+        items = [words.verdict_table(self.findings, words.error_scale(self.findings))]
         if self.differences:
-            found.append(words.difference_table(self.findings, self.differences))
-        return tuple(t for t in found if len(t.head) > 1)  # of models alone only names
+            items.append(words.difference_table(self.findings, self.differences))
+        return tuple(t for t in items if len(t.head) > 1)  # of models alone only names
 
     def __repr__(self) -> str:
         """Return the sentence and the tables."""
@@ -87,9 +87,9 @@ def compare(
 
     Raises InputError for fewer than two, and for what cannot be read.
     """
-    found = read_findings(results, effects)
-    _refuse_fewer(found)
-    return Comparison(found)
+    findings = read_findings(results, effects)
+    _refuse_fewer(findings)
+    return Comparison(findings)
 
 
 def _refuse_fewer(findings: Sequence[Finding]) -> None:
@@ -152,7 +152,7 @@ def _tile(f: Finding) -> tuple[str, str, str]:
 
 
 def write_population(
-    found: Population,
+    population: Population,
     path: str | os.PathLike[str],
     *,
     without: Sequence[tuple[str, str, str]] = (),
@@ -163,11 +163,11 @@ def write_population(
 
     Raises InputError when `path` cannot be written to.
     """
-    p, batches = found, {f.batch for f in found.findings if f.batch}
+    p, batches = population, {f.batch for f in population.findings if f.batch}
     badges = [f"{len(p.findings)} devices"]
     badges += [f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"] if batches else []
     counts = Counter(o.parameter for o in p.outliers)
-    shown = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
+    displayed = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
     page = render(
         "population.html",
         "Population of devices",
@@ -179,7 +179,8 @@ def write_population(
         **words.population_tables(p),
         left_out=words.left_out_sentence(p),
         spread_pictures=[
-            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in shown
+            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning)
+            for s in displayed
         ],
         drift_pictures=[
             Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))

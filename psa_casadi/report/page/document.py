@@ -52,9 +52,9 @@ class Picture:
     note: str = ""
 
 
-def render(template: str, title: str, badges: Sequence[str] = (), **given: Any) -> str:
+def render(template: str, title: str, badges: Sequence[str] = (), **options: Any) -> str:
     """Return a page; no script runs in it but its own, and it asks for nothing outside."""
-    return filled(template, page=_Page(), title=title, badges=badges, made=_made(), **given)
+    return filled(template, page=_Page(), title=title, badges=badges, made=_made(), **options)
 
 
 def filled(template: str, **given: Any) -> str:
@@ -85,10 +85,10 @@ class _Page:
             plotly_figure(panel, lambda array: self._arrays.setdefault(array, len(self._arrays)))
         )
 
-    def live(self, told: Mapping[str, Any]) -> Markup:
+    def live(self, table: Mapping[str, Any]) -> Markup:
         """Return what the script of a model that runs in the page must know of it."""
-        self._alive = told["kind"]
-        return _json(told)
+        self._alive = table["kind"]
+        return _json(table)
 
     def style(self) -> Markup:
         """Return the style sheet."""
@@ -96,9 +96,9 @@ class _Page:
 
     def scripts(self) -> list[Markup]:
         """Return the scripts that the page runs."""
-        found = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
-        found += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
-        return [Markup(text) for text in found]
+        result = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
+        result += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
+        return [Markup(text) for text in result]
 
     def policy(self) -> Markup:
         """Return what a browser is told to refuse: all scripts but the page's, and all requests."""

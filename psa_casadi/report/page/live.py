@@ -105,13 +105,13 @@ class LiveModel:
         module = self.module.result()
         if module is None:
             return None
-        shown = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
-        first, counts = shown[0].series, any(r.series.counts for r in self.records)
-        largest = max(float(np.nanmax(np.abs(r.residual))) for r in shown)
+        displayed = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
+        first, counts = displayed[0].series, any(r.series.counts for r in self.records)
+        largest = max(float(np.nanmax(np.abs(r.residual))) for r in displayed)
         length = handy_scale(first.span, counts=counts)
         error = length_scale(largest or 1e-2 * first.span, counts=counts)
-        limit, rows = _SAMPLES // len(shown), []
-        for r in shown:
+        limit, rows = _SAMPLES // len(displayed), []
+        for r in displayed:
             s = r.series  # of a stack all records have the same units
             scales = {"length": length, "error": error}
             if s.unit:
@@ -128,8 +128,8 @@ class LiveModel:
                     in_brackets("difference", scales["error"].unit),
                 ],
             }
-            told = {n: {"unit": q.unit, "factor": q.factor} for n, q in scales.items()}
-            rows.append({**_record(r, limit, self.design), **told, **words})
+            table = {n: {"unit": q.unit, "factor": q.factor} for n, q in scales.items()}
+            rows.append({**_record(r, limit, self.design), **table, **words})
         return {
             "kind": "report",
             **live_data(self.model, module),
@@ -153,21 +153,23 @@ class LiveModel:
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of a diagnosis alive; `rows` are its series."""
-    module, beyond, share, said = begun_module(d.model), list[FloatArray](), 1.0, ""
+    module, beyond, share, text = begun_module(d.model), list[FloatArray](), 1.0, ""
     if isinstance(d, StackDiagnosis):
         # the page's other errors are judged by the noise of all records together
         share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
         if d.patch is not None:
             beyond = [p - x for p, x in zip(d.patch.predicted, d.extended, strict=True)]
-            said = f"{d.patch.name}, as it was found: it does not follow"
+            text = f"{d.patch.name}, as it was found: it does not follow"
     records = _fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share)
-    return LiveModel(d.model, module, records, extended=added(d), correction=said)
+    return LiveModel(d.model, module, records, extended=added(d), correction=text)
 
 
-def live_fit(found: Identification, rows: Sequence[Series]) -> LiveModel:
+def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of an identification alive; `rows` are its series."""
-    records = _fitted_records(found.model, found.fit, found.experiments, rows)
-    return LiveModel(found.model, begun_module(found.model), records)
+    records = _fitted_records(
+        identification.model, identification.fit, identification.experiments, rows
+    )
+    return LiveModel(identification.model, begun_module(identification.model), records)
 
 
 def live_design(
@@ -182,9 +184,9 @@ def live_design(
     `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
     to follow, where there is one. The model begins in motion, or at `rest`.
     """
-    time, voltage, shown = record
-    aim, words = (shown, "design") if wanted is None else (wanted, "path")
-    curve, none = Curve("model", colours.EXTENDED, shown), np.zeros(len(time), dtype=bool)
+    time, voltage, displayed = record
+    aim, words = (displayed, "design") if wanted is None else (wanted, "path")
+    curve, none = Curve("model", colours.EXTENDED, displayed), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
@@ -195,10 +197,10 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
     s, time = model.structure, record.time - record.time[0]
     start = np.array([q.start for q in s.states])
     u = input_samples(model, record.n, record.columns)
-    shown = run(model, time, u, start, hold=record.hold).y.T
+    displayed = run(model, time, u, start, hold=record.hold).y.T
     along, none = next(iter(record.columns)), np.zeros(record.n, dtype=bool)
     rows = []
-    for output, y in zip(s.outputs, shown, strict=True):
+    for output, y in zip(s.outputs, displayed, strict=True):
         series = Series(
             output.name, time, record.columns[along], y, (Curve("model", colours.EXTENDED, y),),
             none, noise=0.0, counts=False, quantity=output.name, unit=output.unit,
@@ -315,7 +317,7 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         file = dumps(model)
     except InputError:  # no file holds such a model
         file = None
-    shown, s, known = output_of(model), model.structure, determined(model)
+    displayed, s, known = output_of(model), model.structure, determined(model)
     nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
         "name": model.name,
@@ -327,8 +329,8 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         "states": [{**_variable(q), "start": q.start} for q in s.states],
         "nominals": model.state_nominals().tolist(),
         "error_sizes": model.error_sizes().tolist(),
-        "shown": shown,
-        "shown_nominal": 0.0 if shown is None else float(nominals[shown]),
+        "shown": displayed,
+        "shown_nominal": 0.0 if displayed is None else float(nominals[displayed]),
         "starts_itself": model.starts_itself,
         "file": file,
     }

@@ -46,23 +46,23 @@ def write_playground(path: str | os.PathLike[str], model: Model | None = None) -
 
 def playground(model: Model | None = None) -> str:
     """Return the page; see `write_playground`."""
-    given = stack_model(STACK) if model is None else model
-    if "voltage" not in given.input_names or "displacement" not in given.output_names:
+    inputs = stack_model(STACK) if model is None else model
+    if "voltage" not in inputs.input_names or "displacement" not in inputs.output_names:
         raise InputError(
-            [f"The model '{given.name}' has no voltage input or no displacement output: no stack."]
+            [f"The model '{inputs.name}' has no voltage input or no displacement output: no stack."]
         )
-    whole = given.with_declared_starts()
+    whole = inputs.with_declared_starts()
     for effect in EFFECTS.values():
         if not {p.name for p in effect.parameters} & set(whole.parameter_names):
             whole = whole.with_effect(effect)
-    title = next((n for n in STACKS if stack_model(n).name == given.name), given.name)
-    stacks = [_stack(given, whole, title, given.description)]
+    title = next((n for n in STACKS if stack_model(n).name == inputs.name), inputs.name)
+    stacks = [_stack(inputs, whole, title, inputs.description)]
     # the terms of a model that states some are not those of other stacks
-    names = {c.name for c in given.components}
-    if not given.publication.stated and names >= {c.name for c in BASE}:
+    names = {c.name for c in inputs.components}
+    if not inputs.publication.stated and names >= {c.name for c in BASE}:
         others = [name for name in STACKS if name != title]
         stacks += [_stack(stack_model(n), whole, n, STACKS[n].description) for n in others]
-    told = {
+    table = {
         "kind": "playground",
         **live_data(whole, web_module(whole)),
         "stacks": stacks,
@@ -71,7 +71,7 @@ def playground(model: Model | None = None) -> str:
         "band": _BAND,
     }
     badges = ["every effect", "no network"]
-    return render("playground.html", f"Play with {title}", badges, told=told)
+    return render("playground.html", f"Play with {title}", badges, told=table)
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def write_report(
 
 
 def write_fit_report(
-    found: Identification,
+    identification: Identification,
     path: str | os.PathLike[str],
     *,
     origin: str = "measured",
@@ -107,9 +107,11 @@ def write_fit_report(
 
     Raises InputError when `path` cannot be written to.
     """
-    series = series_of_fit(found)
-    live = None if still else live_fit(found, series)
-    atomic_write(path, fit_page(found, series, origin=origin, profiles=profiles, live=live))
+    series = series_of_fit(identification)
+    live = None if still else live_fit(identification, series)
+    atomic_write(
+        path, fit_page(identification, series, origin=origin, profiles=profiles, live=live)
+    )
 
 
 def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
@@ -159,8 +161,8 @@ def _page(
 
 def _alternatives(d: StackDiagnosis, cause: Cause) -> list[str]:
     """Say which models have another effect in a cause's place."""
-    own = [a for a in d.alternatives if a.cause == cause.effect]
-    return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in own]
+    items = [a for a in d.alternatives if a.cause == cause.effect]
+    return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in items]
 
 
 def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
@@ -231,7 +233,7 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
 
 
 def fit_page(
-    found: Identification,
+    identification: Identification,
     series: Sequence[Series],
     *,
     origin: str = "measured",
@@ -243,19 +245,19 @@ def fit_page(
     `live` is the model if it is to run in the page.
     """
     scale = max((s.residual_scale for s in series), key=lambda s: 1.0 / s.factor)
-    stack = found if isinstance(found, StackIdentification) else None
+    stack = identification if isinstance(identification, StackIdentification) else None
     with phrases.one_unit(scale) if stack else nullcontext():
         figures = [residual_figures(s, s.curves[0]) for s in series]
-        graded, tiles = fit_words.grades(found), []
-        error = text.fit_sentence(found) if stack is None else ""
+        graded, tiles = fit_words.grades(identification), []
+        error = text.fit_sentence(identification) if stack is None else ""
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
-            span = max(e.record.range_m for e in found.experiments)
-            error = fit_words.error_sentence(found.fit.rms, noise, span, scale, origin)
+            span = max(e.record.range_m for e in identification.experiments)
+            error = fit_words.error_sentence(identification.fit.rms, noise, span, scale, origin)
             largest = max(f.largest for f in figures)
             tiles = [
                 (f"error, {what}", scale.text(v), f"{number(100.0 * v / span, 2)} % of the range")
-                for what, v in (("rms", found.fit.rms), ("largest", largest))
+                for what, v in (("rms", identification.fit.rms), ("largest", largest))
             ]
             tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
         if fitted := sum(g.degree != "fixed" for g in graded):
@@ -263,15 +265,17 @@ def fit_page(
             tiles.append(("parameters determined", count, "to 10 % or better"))
         return render(
             "fit.html",
-            f"Identification of {'a stack' if stack else plain(found.model.name)}",
-            **_shared(found.model, series, found.experiments, origin, found),
-            found=found,
+            f"Identification of {'a stack' if stack else plain(identification.model.name)}",
+            **_shared(
+                identification.model, series, identification.experiments, origin, identification
+            ),
+            found=identification,
             combinations=stack.combinations if stack else (),
             further=stack.advice if stack else (),
             verdict=f"{error} {fit_words.determined_sentence(graded)}",
             tiles=tiles,
             live=live,
-            determined=_determined(found, graded),
+            determined=_determined(identification, graded),
             profiles=[
                 Picture(
                     f"Profile of {p.name}",
@@ -280,29 +284,29 @@ def fit_page(
                 )
                 for p in profiles
             ],
-            starts=tables.starts_table(found.starts, series[0].residual_scale),
+            starts=tables.starts_table(identification.starts, series[0].residual_scale),
             statuses=_STATUSES,
             errors=tables.fit_error_table(series, figures),
         )
 
 
-def write_posterior(found: Posterior, path: str | os.PathLike[str]) -> None:
+def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
     """Write the page of a posterior, whole or not at all: picture, parameters, what is left.
 
     Raises InputError when `path` cannot be written to.
     """
-    experiments, name = found.task.experiments, plain(found.model.name)
+    experiments, name = posterior.task.experiments, plain(posterior.model.name)
     count = len(experiments)
     records = f"{count} record{'s' if count > 1 else ''}"
     page = render(
         "posterior.html",
         f"Posterior of {name}",
         [records],
-        found=found,
-        verdict=f"The posterior of {name}, given {records}: {text.drawn(found)}.",
-        figure=posterior_figure(found),
-        parameters=text.posterior_table(found),
-        left=text.left_table(found),
+        found=posterior,
+        verdict=f"The posterior of {name}, given {records}: {text.drawn(posterior)}.",
+        figure=posterior_figure(posterior),
+        parameters=text.posterior_table(posterior),
+        left=text.left_table(posterior),
         used=tables.record_table(experiments, "measured"),
     )
     atomic_write(path, page)
@@ -311,13 +315,13 @@ def write_posterior(found: Posterior, path: str | os.PathLike[str]) -> None:
 def _shared(
     model: Model,
     series: Sequence[Series],
-    given: Sequence[Experiment],
+    experiments: Sequence[Experiment],
     origin: str,
-    found: Identification | None = None,
+    identification: Identification | None = None,
 ) -> dict[str, Any]:
     """Return what pages of results show: the record that is missed most, every record, parameters.
 
-    On the page of a fit, `found`, the former is only seen where no script runs.
+    On the page of a fit, `identification`, the former is only seen where no script runs.
     """
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
@@ -329,9 +333,11 @@ def _shared(
         records.time_plot(worst, origin, limit),
         f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
     )
-    known = fit_words.determined(model, found if isinstance(found, StackIdentification) else None)
+    known = fit_words.determined(
+        model, identification if isinstance(identification, StackIdentification) else None
+    )
     others = [n for n in model.parameter_names if n not in known]
-    count = len(given)
+    count = len(experiments)
     return {
         "badges": [f"{origin} data", f"{count} record{'s' if count > 1 else ''}"],
         "origin": origin,
@@ -341,15 +347,17 @@ def _shared(
             "picture": below,
         },
         "parts": [
-            _part(series[k], figures[k], origin, limit, found or series[k].name != worst.name)
+            _part(
+                series[k], figures[k], origin, limit, identification or series[k].name != worst.name
+            )
             for k in sorted(order[:MOST_RECORDS])
         ],
         "count": len(series),
         "parameters": {
-            name: tables.parameter_table(model, found, only) if only else None
+            name: tables.parameter_table(model, identification, only) if only else None
             for name, only in (("known", known), ("others", others))
         },
-        "used": tables.record_table(given, origin),
+        "used": tables.record_table(experiments, origin),
     }
 
 
@@ -368,9 +376,9 @@ def _part(
     """Return what is shown of a record: over time where it is `timed`, and the residual's views."""
     noise = "Dashed: two standard deviations of the noise."
     driver = s.against.partition(" [")[0]
-    shown = records.samples(s, limit)
+    indices = records.samples(s, limit)
     over_it = [
-        Picture(f"Loop: {s.quantity} over {driver}", records.loop_plot(s, origin, shown)),
+        Picture(f"Loop: {s.quantity} over {driver}", records.loop_plot(s, origin, indices)),
         Picture(f"Residual over {driver}", records.error_loop_plot(s, limit), noise),
     ]
     views = [
@@ -490,12 +498,12 @@ def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None
-    seen = signature(effect)
-    view, note = seen.telling.name, size_sentence(seen)
+    observed = signature(effect)
+    view, note = observed.telling.name, size_sentence(observed)
     if view == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
     caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
-    pictures = [Picture(caption, findings.signature_plot(seen), note), _of_the_data(d, view)]
+    pictures = [Picture(caption, findings.signature_plot(observed), note), _of_the_data(d, view)]
     return {
         "name": plain(name),
         "looks_like": effect.looks_like,
@@ -523,13 +531,15 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
     return None if data is None else Picture(data.caption, data.panel, note)
 
 
-def _determined(found: Identification, graded: tuple[fit_words.Grade, ...]) -> list[Picture]:
-    if not found.determinacy.names:
+def _determined(
+    identification: Identification, graded: tuple[fit_words.Grade, ...]
+) -> list[Picture]:
+    if not identification.determinacy.names:
         return []
     errors, note = findings.determinacy_plot(graded), fit_words.error_bar_note(graded)
     pictures = [Picture("Relative standard error of each parameter", errors, note)]
-    if len(found.determinacy.names) > 1:
-        words = fit_words.pairs_sentence(fit_words.strong_pairs(found))
-        plot = findings.correlation_plot(found)
+    if len(identification.determinacy.names) > 1:
+        words = fit_words.pairs_sentence(fit_words.strong_pairs(identification))
+        plot = findings.correlation_plot(identification)
         pictures.append(Picture("Correlation of the estimates", plot, words))
     return pictures

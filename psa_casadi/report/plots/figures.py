@@ -102,8 +102,8 @@ def figure_of(result: Plotted) -> Figure:
         return diagnosis_figure(result)
     if isinstance(result, StackIdentification):
         series = series_of_fit(result)
-        figure, grid, shown = _sheet(series, "measured", "model")
-        _draw_residual(figure.add_subplot(grid[1, :]), shown)
+        figure, grid, displayed = _sheet(series, "measured", "model")
+        _draw_residual(figure.add_subplot(grid[1, :]), displayed)
         return figure
     if isinstance(result, Trajectory):
         return response_figure(result.time, result.voltage, result.displacement)
@@ -120,8 +120,8 @@ def figure_of(result: Plotted) -> Figure:
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
-    figure, grid, shown = _sheet(series_of(diagnosis), origin, "base model", verdict)
-    _draw_residual(figure.add_subplot(grid[1, :2]), shown)
+    figure, grid, displayed = _sheet(series_of(diagnosis), origin, "base model", verdict)
+    _draw_residual(figure.add_subplot(grid[1, :2]), displayed)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
     part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
@@ -134,12 +134,12 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     """Return the picture of one record: measured against model, loop and residual."""
     figure = sheet((12.0, 6.4), 80, layout=None)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.15, 1.0), **_STILL_ROOM)
-    shown = records.samples(s, _MOST_POINTS)
+    indices = records.samples(s, _MOST_POINTS)
     above = figure.add_subplot(grid[0, :2] if s.against else grid[0, :])
-    draw(above, records.measured_plot(s, origin, shown), s.title, legend=_ABOVE)
+    draw(above, records.measured_plot(s, origin, indices), s.title, legend=_ABOVE)
     above.margins(x=0.01)
     if s.against:
-        draw(figure.add_subplot(grid[0, 2]), records.loop_plot(s, origin, shown), "Loop")
+        draw(figure.add_subplot(grid[0, 2]), records.loop_plot(s, origin, indices), "Loop")
     _draw_residual(figure.add_subplot(grid[1, :]), s, origin)
     return figure
 
@@ -150,11 +150,11 @@ def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Fi
     figure = sheet((12.0, 2.6 * len(outputs)), 80)
     grid = figure.subplots(len(outputs), 2, width_ratios=(1.6, 1.0), squeeze=False)
     for s, (left, right) in zip(outputs, grid, strict=True):
-        shown = records.samples(s, _MOST_POINTS)
+        indices = records.samples(s, _MOST_POINTS)
         legend = _ABOVE if s is outputs[0] else None
-        draw(left, records.measured_plot(s, origin, shown), legend=legend)
+        draw(left, records.measured_plot(s, origin, indices), legend=legend)
         left.margins(x=0.01)
-        draw(right, records.residual_plot(s, shown), f"Residual of {s.title}")
+        draw(right, records.residual_plot(s, indices), f"Residual of {s.title}")
         right.margins(x=0.01)
     figure.suptitle(f"{origin} record: {outputs[0].record}", fontsize=FONT)
     return figure
@@ -185,12 +185,12 @@ def bode_figure(of: Linear) -> Figure:
     sizes = np.abs(of.poles)[np.abs(of.poles) > 0] / (2 * np.pi)
     low, high = (float(f(sizes)) if sizes.size else 1.0 for f in (np.min, np.max))
     hertz = np.geomspace(0.1 * low, 10.0 * high, 1500)
-    found = of.response(2 * np.pi * hertz)
+    result = of.response(2 * np.pi * hertz)
     figure = sheet((4.5 * max(2, len(of.inputs)), 7.0), DPI)
     rows = figure.subplots(2, len(of.inputs), sharex=True, squeeze=False)
     for k, i in enumerate(of.inputs):
         for j, o in enumerate(of.outputs):
-            of_one = found[:, j, k]
+            of_one = result[:, j, k]
             size, usual = (nominal_value(v.nominal, {}) for v in (i, o))
             if np.max(np.abs(of_one)) * size > _NOTHING * usual:  # else it is rounding
                 style_of = {"color": f"C{j}", "linestyle": _LINES[j % len(_LINES)]}
@@ -235,9 +235,13 @@ def _sheet(
     figure = sheet(SIZE_INCHES, DPI)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     grid = figure.add_gridspec(2, 3, **ratios)
-    shown, window = records.samples(s, _MOST_POINTS), telling_window(s)
+    displayed, window = records.samples(s, _MOST_POINTS), telling_window(s)
     whole, part, loop = (figure.add_subplot(grid[0, k]) for k in range(3))
-    draw(whole, records.measured_plot(s, origin, shown), f"{s.title} (box: the part on the right)")
+    draw(
+        whole,
+        records.measured_plot(s, origin, displayed),
+        f"{s.title} (box: the part on the right)",
+    )
     ends = s.time_scale.factor * s.time[window][[0, -1]]
     whole.axvspan(*ends, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
     whole.margins(x=0.01)
@@ -245,7 +249,7 @@ def _sheet(
         "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
     )
     draw(part, records.zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
-    draw(loop, records.loop_plot(s, origin, shown), "Loop", legend={"loc": "upper left"})
+    draw(loop, records.loop_plot(s, origin, displayed), "Loop", legend={"loc": "upper left"})
     which = f"{origin} record: {s.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the {model} misses most)"
@@ -255,8 +259,8 @@ def _sheet(
 
 def _draw_residual(axes: Axes, s: Series, origin: str = "measured") -> None:
     """Draw what the models leave of a record, with room for the legend above."""
-    shown = records.samples(s, _MOST_POINTS)
-    draw(axes, records.residual_plot(s, shown), f"Residual: {origin} minus model", legend=_OVER)
+    indices = records.samples(s, _MOST_POINTS)
+    draw(axes, records.residual_plot(s, indices), f"Residual: {origin} minus model", legend=_OVER)
     axes.margins(x=0.005)
     largest = max(float(np.nanmax(np.abs(s.residual(c)))) for c in s.curves)
     largest = s.residual_scale.factor * largest or 1.0
@@ -331,14 +335,17 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         if name == "residual":
             _draw_residual(axes, most_telling(series))
         else:
-            shown = most_telling([s for s in series if s.quantity == name])
-            whole = replace(shown, held_out=np.zeros(len(shown.time), dtype=bool))
+            displayed = most_telling([s for s in series if s.quantity == name])
+            whole = replace(displayed, held_out=np.zeros(len(displayed.time), dtype=bool))
             draw(
-                axes, records.measured_plot(whole, "measured", slice(None)), shown.title, legend={}
+                axes,
+                records.measured_plot(whole, "measured", slice(None)),
+                displayed.title,
+                legend={},
             )
             axes.margins(x=0.01)
-    found: Figure | SubFigure = axes.figure
-    return found if isinstance(found, Figure) else found.figure
+    matches: Figure | SubFigure = axes.figure
+    return matches if isinstance(matches, Figure) else matches.figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
@@ -361,91 +368,91 @@ def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: st
     draw(axes, Panel("time [s]", label).line(time, scale.factor * values, name))
 
 
-def posterior_figure(found: Posterior) -> Figure:
+def posterior_figure(posterior: Posterior) -> Figure:
     """Return what prior and posterior predict of the record missed most, and the parameters."""
-    shown = _missed_most(found)
-    figures = found.figures[:_MOST_PARAMETERS]
+    block = _missed_most(posterior)
+    figures = posterior.figures[:_MOST_PARAMETERS]
     rows = -(-len(figures) // _COLUMNS)
     figure = sheet((SIZE_INCHES[0], 4.6 + 2.6 * rows), DPI)
     parts = figure.subfigures(2, 1, height_ratios=(4.6, 2.6 * rows), squeeze=False)
     before, after = parts[0, 0].subplots(1, 2)
-    _draw_predicted(before, found, shown, "prior")
-    _draw_predicted(after, found, shown, "posterior")
+    _draw_predicted(before, posterior, block, "prior")
+    _draw_predicted(after, posterior, block, "posterior")
     axes = np.atleast_1d(parts[1, 0].subplots(rows, min(_COLUMNS, len(figures)))).ravel()
     for each, f in zip(axes, figures, strict=False):
-        _draw_parameter(each, found, f)
+        _draw_parameter(each, posterior, f)
     for each in axes[len(figures) :]:
         each.set_axis_off()
-    name = found.task.experiments[shown.record].record.name
-    more = len(found.figures) - len(figures)
+    name = posterior.task.experiments[block.record].record.name
+    more = len(posterior.figures) - len(figures)
     rest = f"; {more} more parameters are in the table" if more else ""
     figure.suptitle(
-        f"Prior and posterior of {found.model.name}, record {name}{rest}", fontsize=FONT
+        f"Prior and posterior of {posterior.model.name}, record {name}{rest}", fontsize=FONT
     )
     return figure
 
 
-def _missed_most(found: Posterior) -> Block:
+def _missed_most(posterior: Posterior) -> Block:
     """Return the output of a record that the model misses most, over the output's range."""
 
     def share(b: Block) -> float:
-        parts = [e.measured(b.channel)[e.at(b.channel)] for e in found.task.experiments]
+        parts = [e.measured(b.channel)[e.at(b.channel)] for e in posterior.task.experiments]
         return b.level / max(float(np.ptp(np.concatenate(parts))), 1e-300)
 
-    return max(found.task.density.blocks, key=share)
+    return max(posterior.task.density.blocks, key=share)
 
 
-def _scale(found: Posterior, b: Block, size: float) -> phrases.Scale:
+def _scale(posterior: Posterior, b: Block, size: float) -> phrases.Scale:
     """Return what numbers of a block of this size are shown in."""
-    unit = found.task.channel(b).unit
+    unit = posterior.task.channel(b).unit
     return phrases.length_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
 
 
-def _band(found: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _band(posterior: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the ends of the band that holds 94 % of what is predicted, and the median."""
-    draws = found.tree[group][column_of(found.task, b)].to_numpy()
+    draws = posterior.tree[group][column_of(posterior.task, b)].to_numpy()
     draws = draws.reshape(-1, draws.shape[-1])
     low, high = 0.5 * (1.0 - HDI), 0.5 * (1.0 + HDI)
     ends: FloatArray = np.quantile(draws, [low, high, 0.5], axis=0)
     return ends[0], ends[1], ends[2]
 
 
-def _draw_predicted(axes: Axes, found: Posterior, block: Block, group: str) -> None:
+def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) -> None:
     """Draw a record in the band that prior or posterior predict, of the posterior less its median.
 
     The prior's is cut where it leaves the record too far behind.
     """
-    if not found.tree[f"{group}_predictive"].sizes["draw"]:
+    if not posterior.tree[f"{group}_predictive"].sizes["draw"]:
         style(axes, "No draw of the prior can be simulated", "time [s]", "")
         return
-    e, is_prior = found.task.experiments[block.record], group == "prior"
+    e, is_prior = posterior.task.experiments[block.record], group == "prior"
     time, y, name = e.record.time, e.measured(block.channel), "difference"
-    low, high, middle = _band(found, f"{group}_predictive", block)
+    low, high, middle = _band(posterior, f"{group}_predictive", block)
     title, look = "Posterior predictive, less its median", (colours.EXTENDED, 0.4, 3)
     if is_prior:
         title, look = "Prior predictive", (colours.BASE, 0.3, 1)
-        middle, name = np.zeros_like(y), found.task.channel(block).column
+        middle, name = np.zeros_like(y), posterior.task.channel(block).column
     ends = np.array([np.nanmin(y), np.nanmax(y)])
     size = 3.0 * np.ptp(ends) if is_prior else np.nanmax(np.abs(y - middle))
-    scale = _scale(found, block, float(size))
-    low, high, shown = (scale.factor * (v - middle) for v in (low, high, y))
+    scale = _scale(posterior, block, float(size))
+    low, high, displayed = (scale.factor * (v - middle) for v in (low, high, y))
     if not is_prior:  # measured comes first in its legend
-        axes.plot(time, shown, color=colours.MEASURED, linewidth=0.8, label="measured")
+        axes.plot(time, displayed, color=colours.MEASURED, linewidth=0.8, label="measured")
     colour, alpha, order = look
     band = f"{group}, {100.0 * HDI:.0f} %"
     axes.fill_between(time, low, high, color=colour, alpha=alpha, label=band, zorder=order)
     if is_prior:
-        axes.plot(time, shown, color=colours.MEASURED, linewidth=1.0, label="measured")
+        axes.plot(time, displayed, color=colours.MEASURED, linewidth=1.0, label="measured")
         axes.set_ylim(*(scale.factor * (np.mean(ends) + np.array([-1.5, 1.5]) * np.ptp(ends))))
     style(axes, title, "time [s]", phrases.in_brackets(name, scale.unit))
     axes.legend(fontsize=FONT - 1, loc="upper right")
 
 
-def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
+def _draw_parameter(axes: Axes, posterior: Posterior, f: Figures) -> None:
     """Draw the posterior of a parameter, and its prior."""
-    unit, display = phrases.shown_in(found.model, f.name)
+    unit, display = phrases.shown_in(posterior.model, f.name)
     values, before = (
-        np.array([convert(v, unit, display) for v in found.tree[g][f.name].to_numpy().ravel()])
+        np.array([convert(v, unit, display) for v in posterior.tree[g][f.name].to_numpy().ravel()])
         for g in ("posterior", "prior")
     )
     axes.hist(values, bins=_BINS, density=True, color=colours.EXTENDED, alpha=0.7)
@@ -463,7 +470,7 @@ def _draw_parameter(axes: Axes, found: Posterior, f: Figures) -> None:
     axes.set_yticks([])
 
 
-def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[str]) -> None:
+def save_signature(effect: Component, signature: Signature, path: str | os.PathLike[str]) -> None:
     """Write the picture of an effect's signature, 1300 x 620 points, whole or not at all.
 
     It is an SVG or a PDF where `path` ends so, else a PNG. Left the difference over time above the
@@ -472,36 +479,36 @@ def save_signature(effect: Component, seen: Signature, path: str | os.PathLike[s
     """
     figure = sheet((13.0, 6.2), DPI)
     left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    scale = phrases.length_scale(float(np.max(np.abs(seen.difference))))
-    clock = time_scale(float(seen.time[-1]))
-    time = clock.factor * seen.time
+    scale = phrases.length_scale(float(np.max(np.abs(signature.difference))))
+    clock = time_scale(float(signature.time[-1]))
+    time = clock.factor * signature.time
     behind = left.twinx()
-    behind.fill_between(time, seen.voltage, color=colours.NOISE, alpha=0.18, linewidth=0)
+    behind.fill_between(time, signature.voltage, color=colours.NOISE, alpha=0.18, linewidth=0)
     behind.set_ylabel("voltage [V] (grey)", fontsize=FONT, color=colours.NOISE)
     behind.tick_params(labelsize=FONT - 1, colors=colours.NOISE)
     left.set_zorder(behind.get_zorder() + 1)
     left.patch.set_visible(False)
     added_over_time = Panel(f"time [{clock.unit}]", f"difference [{scale.unit}]")
-    added_over_time.line(time, scale.factor * seen.difference)
+    added_over_time.line(time, scale.factor * signature.difference)
     draw(left, added_over_time, "What the effect adds, over time")
     left.margins(x=0.01)
-    view = seen.telling
+    view = signature.telling
     title = f"{AXES[view.name].title}: explains {phrases.percent(view.share)} of it"
     if view.name == "spectrum":
         title = f"Spectrum: {phrases.percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}
-    draw(right, signature_plot(seen), textwrap.fill(title, 48), legend=legend)
+    draw(right, signature_plot(signature), textwrap.fill(title, 48), legend=legend)
     look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
-    figure.suptitle(f"{look}\n{size_sentence(seen)}", fontsize=FONT + 1)
+    figure.suptitle(f"{look}\n{size_sentence(signature)}", fontsize=FONT + 1)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=picture_format(path), dpi=DPI)
 
 
-def size_sentence(seen: Signature) -> str:
+def size_sentence(signature: Signature) -> str:
     """Say on what stack the signature is simulated, and how large the effect is."""
-    size = phrases.with_unit(phrases.number(seen.size), seen.unit)
-    largest = float(np.max(np.abs(seen.difference))) / seen.stroke
+    size = phrases.with_unit(phrases.number(signature.size), signature.unit)
+    largest = float(np.max(np.abs(signature.difference))) / signature.stroke
     return (
-        f"Simulated on the stack {seen.stack} with {seen.gain} = {size}: at most"
+        f"Simulated on the stack {signature.stack} with {signature.gain} = {size}: at most"
         f" {phrases.number(100.0 * largest, 2)} % of the stroke, offset and slope re-fitted."
     )

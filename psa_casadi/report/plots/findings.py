@@ -118,9 +118,12 @@ def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool
     return plot.axes(logarithmic(_ends(before.frequency)), logarithmic(ends))
 
 
-def signature_plot(seen: Signature) -> Panel:
+def signature_plot(signature: Signature) -> Panel:
     """What an effect adds along its telling coordinate: samples behind their binned means."""
-    view, scale = seen.telling, phrases.length_scale(float(np.max(np.abs(seen.difference))))
+    view, scale = (
+        signature.telling,
+        phrases.length_scale(float(np.max(np.abs(signature.difference)))),
+    )
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
     look: dict[str, Any] = {"line": {"color": colours.EXTENDED, "width": 1.8}}
@@ -132,15 +135,15 @@ def signature_plot(seen: Signature) -> Panel:
         axis["title"] = {"text": f"difference [{scale.unit}/√Hz]", "standoff": 8}
         return plot.axes(y=axis, showlegend=False)
     low, high = _ends(view.x)
-    on = np.flatnonzero((seen.coordinate >= low) & (seen.coordinate <= high))
+    on = np.flatnonzero((signature.coordinate >= low) & (signature.coordinate <= high))
     on = on[:: max(1, on.size // _BEHIND)]
-    behind = factor * seen.coordinate[on], scale.factor * seen.counted[on]
+    behind = factor * signature.coordinate[on], scale.factor * signature.counted[on]
     plot.marks(*behind, "samples", colours.NOISE, 3)
     return plot.marks(factor * view.x, mean, "binned means", **look)
 
 
 def _view_panel(
-    view: View, scale: phrases.Scale, what: str, shown: list[FloatArray]
+    view: View, scale: phrases.Scale, what: str, arrays: list[FloatArray]
 ) -> tuple[Panel, float]:
     """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
@@ -148,7 +151,7 @@ def _view_panel(
         f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
     )
     if view.name.startswith(("since_reversal", "holds", "spectrum")):
-        plot.axes(logarithmic(_ends(factor * np.concatenate(shown))))
+        plot.axes(logarithmic(_ends(factor * np.concatenate(arrays))))
     return plot.axes(y={"zeroline": True, "zerolinecolor": colours.NOISE}), factor
 
 
@@ -163,8 +166,8 @@ def correction_plot(d: Diagnosis, c: Correction) -> tuple[str, Panel]:
     """
     if isinstance(c, FreeFunction):
         largest = float(np.max(np.abs(c.along), initial=0.0))
-        seen = phrases.prefixed_scale(largest, c.variable_unit or "1")
-        at, added, name, unit = seen.factor * c.along, c.added, c.variable, seen.unit
+        observed = phrases.prefixed_scale(largest, c.variable_unit or "1")
+        at, added, name, unit = observed.factor * c.along, c.added, c.variable, observed.unit
         scale = phrases.prefixed_scale(float(np.max(np.abs(added), initial=0.0)), c.unit)
     elif isinstance(c, Patch):
         k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
@@ -194,12 +197,12 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     """One bar for every parameter: its standard error over its value, on a logarithmic axis."""
     fitted = sorted((g for g in graded if g.degree != "fixed"), key=lambda g: g.error)
     rows = [*fitted, *(g for g in graded if g.degree == "fixed")]
-    shown = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
-    left = 10.0 ** math.floor(math.log10(min([1.0, *shown]) * 0.5))
-    right = max([100.0, *shown]) * 15.0
+    items = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
+    left = 10.0 ** math.floor(math.log10(min([1.0, *items]) * 0.5))
+    right = max([100.0, *items]) * 15.0
     plot = Panel("relative standard error [%]", height=_MARGINS + _BAR * len(rows))
     for degree in DEGREES:
-        group = [(g, x) for g, x in zip(fitted, shown, strict=True) if g.degree == degree]
+        group = [(g, x) for g, x in zip(fitted, items, strict=True) if g.degree == degree]
         if group:
             names = [g.name for g, _ in group]
             plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
@@ -223,26 +226,29 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     )  # fmt: skip
 
 
-def correlation_plot(found: Identification) -> Panel:
+def correlation_plot(identification: Identification) -> Panel:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
-    names, matrix = list(found.determinacy.names), found.determinacy.correlations
-    written, rows = len(names) <= _MOST_FIGURES, max(10, len(found.model.structure.parameters))
+    names, matrix = list(identification.determinacy.names), identification.determinacy.correlations
+    written, rows = (
+        len(names) <= _MOST_FIGURES,
+        max(10, len(identification.model.structure.parameters)),
+    )
     plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
              for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
-    for sign, colour, said in (
+    for sign, colour, statement in (
         (1.0, colours.EXTENDED, "positive"),
         (-1.0, colours.BASE, "negative"),
     ):
-        shown = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
-        look = {"color": colour, "opacity": [abs(v) for _, _, v in shown]}
+        items = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
+        look = {"color": colour, "opacity": [abs(v) for _, _, v in items]}
         plot.bars(  # a cell is a bar that begins at its column
-            [0.92] * len(shown), [names[i] for i, _, _ in shown], said, look, width=0.92,
-            base=[k - 0.46 for _, k, _ in shown],
-            text=[_correlation_text(v) if written and i > k else "" for i, k, v in shown],
+            [0.92] * len(items), [names[i] for i, _, _ in items], statement, look, width=0.92,
+            base=[k - 0.46 for _, k, _ in items],
+            text=[_correlation_text(v) if written and i > k else "" for i, k, v in items],
             textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
             textfont={"size": 10, "color": colours.INK},
-            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in shown],
+            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in items],
             hovertemplate="%{hovertext}<extra></extra>",
         )  # fmt: skip
     bare = {"showgrid": False, "ticks": "", "mirror": False, "showline": False, "automargin": True}
@@ -280,8 +286,8 @@ def profile_plot(p: Profile) -> Panel:
     else:
         at = np.linspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = (at - p.estimate) / p.standard_error
-    shown = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
-    plot.line(shown, away**2, "linearised", colours.NOISE, dash="dot")
+    displayed = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
+    plot.line(displayed, away**2, "linearised", colours.NOISE, dash="dot")
     low, high = (
         edge if end is None else convert(end, p.unit, p.display_unit)
         for end, edge in ((p.low, span[0]), (p.high, span[1]))

@@ -160,8 +160,8 @@ def logarithmic(values: tuple[float, float]) -> dict[str, Any]:
 
 def plotly_figure(panel: Panel, hold: Callable[[str], Any] = str) -> dict[str, Any]:
     """Return what plotly reads; `hold` keeps a long array and returns what stands for it."""
-    found: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
-    return found
+    table: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
+    return table
 
 
 def _encoded(value: Any, key: str, hold: Callable[[str], Any]) -> Any:
@@ -220,9 +220,9 @@ def style(axes: Axes, title: str, x: str, y: str, *, font: float = FONT) -> None
 
 
 def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
-    shown = t["name"] if t.get("showlegend", True) else None
+    displayed = t["name"] if t.get("showlegend", True) else None
     if t["type"] == "bar":
-        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=shown)
+        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=displayed)
         return
     if t["mode"] == "text":
         for x, y, text in zip(t["x"], t["y"], t["text"], strict=True):
@@ -232,7 +232,7 @@ def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
     look = line or marker or {}
     errors = t.get("error_y")
     axes.errorbar(
-        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=shown,
+        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=displayed,
         color=look["color"], linestyle=_DASHES[line.get("dash", "solid")] if line else "none",
         linewidth=_POINTS * line["width"] if line else 0.0, elinewidth=0.8,
         marker=_SYMBOLS[marker.get("symbol", "circle")] if marker else None,
@@ -252,13 +252,13 @@ def _draw_shape(axes: Axes, s: Settings) -> None:
     put(place, linewidth=_POINTS * s["line"]["width"], label=name or None, **look)
 
 
-def _draw_axis(axes: Axes, which: str, told: Settings) -> None:
-    log = told.get("type") == "log"
+def _draw_axis(axes: Axes, which: str, settings: Settings) -> None:
+    log = settings.get("type") == "log"
     if log:
         axes.set(**{f"{which}scale": "log"})
-    if "range" in told:
-        axes.set(**{f"{which}lim": [10.0**v if log else v for v in told["range"]]})
-    if "tickvals" in told:
-        getattr(axes, f"set_{which}ticks")(told["tickvals"], labels=told["ticktext"])
-    if told.get("showticklabels") is False:
+    if "range" in settings:
+        axes.set(**{f"{which}lim": [10.0**v if log else v for v in settings["range"]]})
+    if "tickvals" in settings:
+        getattr(axes, f"set_{which}ticks")(settings["tickvals"], labels=settings["ticktext"])
+    if settings.get("showticklabels") is False:
         getattr(axes, f"set_{which}ticks")([])

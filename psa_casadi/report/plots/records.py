@@ -26,46 +26,48 @@ def samples(s: series.Series, limit: int) -> IndexArray:
 
 def time_plot(s: series.Series, origin: str, limit: int) -> Panel:
     """What was measured over time above the residual over the same time, held-out part shaded."""
-    shown = samples(s, limit)
-    return stacked(measured_plot(s, origin, shown), residual_plot(s, shown), _FULL)
+    indices = samples(s, limit)
+    return stacked(measured_plot(s, origin, indices), residual_plot(s, indices), _FULL)
 
 
-def measured_plot(s: series.Series, origin: str, shown: Samples) -> Panel:
+def measured_plot(s: series.Series, origin: str, displayed: Samples) -> Panel:
     """What was measured over time, and the models."""
     clock = s.time_scale
     plot = Panel(f"time [{clock.unit}]", s.label)
-    return _with_held_out(_measured(plot, clock.factor * s.time[shown], s, origin, shown, 1.4), s)
+    return _with_held_out(
+        _measured(plot, clock.factor * s.time[displayed], s, origin, displayed, 1.4), s
+    )
 
 
-def residual_plot(s: series.Series, shown: Samples) -> Panel:
+def residual_plot(s: series.Series, displayed: Samples) -> Panel:
     """What the models leave over time, with the noise."""
     clock = s.time_scale
     plot = Panel(f"time [{clock.unit}]", in_brackets("residual", s.residual_scale.unit))
-    return _with_held_out(_residuals(plot, clock.factor * s.time[shown], s, shown, 1.0), s)
+    return _with_held_out(_residuals(plot, clock.factor * s.time[displayed], s, displayed, 1.0), s)
 
 
 def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
     """What was measured over time in the window where the curves are easiest to tell apart."""
     window = series.telling_window(s)
-    shown = np.arange(len(s.time))[window]
-    shown = shown[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
-    time, y = s.time_scale.factor * s.time[shown], s.scale.factor * s.measured[shown]
+    displayed = np.arange(len(s.time))[window]
+    displayed = displayed[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
+    time, y = s.time_scale.factor * s.time[displayed], s.scale.factor * s.measured[displayed]
     plot = Panel(f"time [{s.time_scale.unit}]", s.label)
     thin = {"color": colours.NOISE, "width": 0.7}
     plot.marks(time, y, origin, colours.MEASURED, 4, line=thin)
-    return _models(plot, time, s, shown, 2.2)
+    return _models(plot, time, s, displayed, 2.2)
 
 
-def loop_plot(s: series.Series, origin: str, shown: Samples) -> Panel:
+def loop_plot(s: series.Series, origin: str, displayed: Samples) -> Panel:
     """What was measured over what drives it, such as displacement over voltage."""
-    return _measured(Panel(s.against, s.label), s.voltage[shown], s, origin, shown, 1.2)
+    return _measured(Panel(s.against, s.label), s.voltage[displayed], s, origin, displayed, 1.2)
 
 
 def error_loop_plot(s: series.Series, limit: int) -> Panel:
     """Residual over what drives the model: where in the loop the model goes wrong."""
-    shown, label = samples(s, limit), in_brackets("residual", s.residual_scale.unit)
+    displayed, label = samples(s, limit), in_brackets("residual", s.residual_scale.unit)
     plot = Panel(s.against, label, showlegend=len(s.curves) > 1)
-    return _residuals(plot, s.voltage[shown], s, shown, 0.9)
+    return _residuals(plot, s.voltage[displayed], s, displayed, 0.9)
 
 
 def spectrum_plot(s: series.Series, limit: int) -> Panel:
@@ -77,10 +79,10 @@ def spectrum_plot(s: series.Series, limit: int) -> Panel:
     for curve in s.curves:
         frequency, density = series.spectrum(s.time, s.residual(curve))
         ends = (float(frequency[0]), float(frequency[-1]))
-        shown = series.shown_lines(frequency, density, min(limit // 2, _SPECTRUM_POINTS))
-        values = small.factor * density[shown]
+        indices = series.shown_lines(frequency, density, min(limit // 2, _SPECTRUM_POINTS))
+        values = small.factor * density[indices]
         reached += [float(np.min(values)), float(np.max(values))]
-        plot.line(frequency[shown], values, curve.label, curve.colour)
+        plot.line(frequency[indices], values, curve.label, curve.colour)
     plot.line(list(ends), [floor, floor], "noise floor", colours.INK, dash="dash")
     return plot.axes(logarithmic(ends), logarithmic((min(reached), max(reached))))
 
@@ -119,9 +121,9 @@ def distribution_plot(s: series.Series) -> Panel:
     for curve, residual in zip(s.curves, residuals, strict=True):
         centres, shares, width = series.distribution(residual, low, high)
         beyond = 100.0 - float(np.sum(shares))
-        said = f" ({beyond:.0f} % outside)" if beyond >= 0.5 else ""
+        text = f" ({beyond:.0f} % outside)" if beyond >= 0.5 else ""
         fill = "tozeroy" if curve is s.curves[-1] else "none"
-        plot.line(small.factor * centres, shares, f"{curve.label}{said}", curve.colour, fill=fill)
+        plot.line(small.factor * centres, shares, f"{curve.label}{text}", curve.colour, fill=fill)
         plot.data[-1]["line"]["shape"] = "hvh"
     mean, spread = float(np.nanmean(residuals[-1])), float(np.nanstd(residuals[-1]))
     if spread > 0:
@@ -132,22 +134,26 @@ def distribution_plot(s: series.Series) -> Panel:
 
 
 def _measured(
-    plot: Panel, x: FloatArray, s: series.Series, origin: str, shown: Samples, width: float
+    plot: Panel, x: FloatArray, s: series.Series, origin: str, displayed: Samples, width: float
 ) -> Panel:
-    plot.line(x, s.scale.factor * s.measured[shown], origin, colours.MEASURED, 3.0)
-    return _models(plot, x, s, shown, width)
+    plot.line(x, s.scale.factor * s.measured[displayed], origin, colours.MEASURED, 3.0)
+    return _models(plot, x, s, displayed, width)
 
 
-def _models(plot: Panel, x: FloatArray, s: series.Series, shown: Samples, width: float) -> Panel:
+def _models(
+    plot: Panel, x: FloatArray, s: series.Series, displayed: Samples, width: float
+) -> Panel:
     for curve in s.curves:
-        plot.line(x, s.scale.factor * curve.values[shown], curve.label, curve.colour, width)
+        plot.line(x, s.scale.factor * curve.values[displayed], curve.label, curve.colour, width)
     return plot
 
 
-def _residuals(plot: Panel, x: FloatArray, s: series.Series, shown: Samples, width: float) -> Panel:
+def _residuals(
+    plot: Panel, x: FloatArray, s: series.Series, displayed: Samples, width: float
+) -> Panel:
     """Add what the models leave, with the noise."""
     for curve in s.curves:
-        residual = s.residual_scale.factor * s.residual(curve)[shown]
+        residual = s.residual_scale.factor * s.residual(curve)[displayed]
         plot.line(x, residual, curve.label, curve.colour, width)
     edge = 2.0 * s.residual_scale.factor * s.noise
     return plot.across(-edge, edge, name="noise (2 sigma)") if edge > 0.0 else plot

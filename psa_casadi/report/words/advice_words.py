@@ -232,8 +232,8 @@ def _advice(a: Advice) -> str:
     words = plan_words(a.plan)
     words += "".join(f", or {plan_words(o, sampled=False)}," for o in a.instead)
     times = {1: "", 2: ", twice,"}.get(a.repeats, f", {a.repeats} times,")
-    beside = "together with what is advised above, " if a.kind == "together" else ""
-    text = f"{beside}{words}{times} would determine {listing(a.parameters)}."
+    others = "together with what is advised above, " if a.kind == "together" else ""
+    text = f"{others}{words}{times} would determine {listing(a.parameters)}."
     return text[0].upper() + text[1:]
 
 

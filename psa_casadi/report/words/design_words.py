@@ -43,7 +43,7 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
     model = design.rivals[0].model
     capacitance = model.values.get("C_p") if is_stack(model) else None
-    said = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
+    statement = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
     record, parts = design.record, []
     for name, values in record.columns.items():
         unit, rate = (
@@ -51,32 +51,32 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
             float(np.max(np.abs(np.diff(values) / np.diff(record.time)))),
         )
         current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
-        shown = "" if unit == "1" else f" {unit}"
-        each = f"{shown} a second" if shown == "" or "/" in unit else f"{shown}/s"
+        displayed = "" if unit == "1" else f" {unit}"
+        each = f"{displayed} a second" if displayed == "" or "/" in unit else f"{displayed}/s"
         named = f"{name} " if len(record.columns) > 1 else ""
         parts.append(
-            f"{named}{number(values.min())} to {number(values.max())}{shown}, at most"
+            f"{named}{number(values.min())} to {number(values.max())}{displayed}, at most"
             f" {number(rate)}{each}{current}"
         )
     inputs = (
         f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
         f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
     )
-    return (*said, inputs)
+    return (*statement, inputs)
 
 
 def _chances(design: Separated) -> tuple[str, ...]:
     """Say how surely the record names each effect if it is the cause, and what would be sure."""
     parts = [f"{plain(n)} with {probability_text(p)}" for n, p in design.chance.items()]
     usual = [f"{number(design.factor(n), 2)} times what a {n} gives" for n in design.usual_chance]
-    said = (
+    text = (
         f"It is predicted to name the cause, if that is {listing(parts, 'or')}; the least ln of"
         f" the Bayes factor between two of them grows by"
         f" {number(min(p.designed for p in design.pairs))}, {listing(usual)} of the same length"
         " and amplitude."
     )
     if design.plays == 1:
-        return (said,)
+        return (text,)
     if design.plays is None:
         again = (
             f"No record was found that is predicted to decide with {percent(ASKED)}, not even one"
@@ -89,7 +89,7 @@ def _chances(design: Separated) -> tuple[str, ...]:
             f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
             f" own, are predicted to name the cause with {percent(ASKED)} or more."
         )
-    return said, again
+    return text, again
 
 
 def _narrower(design: Informative) -> str:
@@ -139,9 +139,9 @@ def _intervals(design: Informative) -> Table:
         )
         value = number(convert(model.values[name], unit, display), 4)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
-        told = half < 10 and after != model.parameter(name).bounds
+        output = half < 10 and after != model.parameter(name).bounds
         rows.append(
-            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if told else "open")
+            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if output else "open")
         )
     head = ("parameter", "value", "unit", "known before", "95 % interval after", "half width")
     return Table(head, tuple(rows))
@@ -222,11 +222,11 @@ def limits_table(response: Response, limits: AmplifierLimits) -> Titled:
     rows = []
     for name, low, high, limit, unit in usage(response, limits):
         used = high if name == "voltage" else max(abs(low), abs(high))
-        given = number(limit) if np.isfinite(limit) else "none"
+        text = number(limit) if np.isfinite(limit) else "none"
         margin = number(limit - used) if np.isfinite(limit) else ""
         if name == "voltage" and np.isfinite(limits.min_voltage):
-            given = f"{number(limits.min_voltage)} to {given if margin else 'any'}"
+            text = f"{number(limits.min_voltage)} to {text if margin else 'any'}"
             margin = number(min(limit - high, low - limits.min_voltage))
-        rows.append((f"{name} [{unit}]", number(low), number(high), given, margin))
+        rows.append((f"{name} [{unit}]", number(low), number(high), text, margin))
     head = ("quantity", "least", "largest", "limit", "margin")
     return Titled("Limits and margins", Table(head, tuple(rows)))

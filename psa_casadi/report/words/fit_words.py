@@ -37,36 +37,38 @@ class Grade:
     by_change: bool = False
 
 
-def grades(found: Identification) -> tuple[Grade, ...]:
+def grades(identification: Identification) -> tuple[Grade, ...]:
     """Return a grade for every parameter of the identified model, in the model's order."""
-    return tuple(grade(found, p.name) for p in found.model.structure.parameters)
+    return tuple(grade(identification, p.name) for p in identification.model.structure.parameters)
 
 
-def grade(found: Identification, name: str) -> Grade:
+def grade(identification: Identification, name: str) -> Grade:
     """Return the grade of one parameter."""
-    values, errors = found.model.values, found.errors
+    values, errors = identification.model.values, identification.errors
     if name not in errors:
         return Grade(name, float("nan"), "fixed")
-    parameter = found.model.parameter(name)
+    parameter = identification.model.parameter(name)
     size = abs(values[name]) if parameter.log else parameter.typical(values)
     error = errors[name] / size if size > 0 else float("inf")
     degree: Degree = "weak" if error > WEAK_ERROR else "determined"
-    if name in found.determinacy.on_bound:
+    if name in identification.determinacy.on_bound:
         degree = "on its bound"
-    elif name in found.undetermined:
+    elif name in identification.undetermined:
         degree = "undetermined"
     return Grade(name, error, degree, by_change=not parameter.log)
 
 
-def determined(model: Model, found: StackIdentification | None = None) -> frozenset[str]:
+def determined(
+    model: Model, stack_identification: StackIdentification | None = None
+) -> frozenset[str]:
     """Return the parameters that the records determine, if only weakly.
 
     Without the identification that found them they are those whose 95 % interval is that of a
     standard error below `DETERMINED_WIDTH`.
     """
-    if found is not None:
-        known = {g.name for g in grades(found) if g.degree in ("determined", "weak")}
-        return frozenset(known | set(found.read_off))
+    if stack_identification is not None:
+        known = {g.name for g in grades(stack_identification) if g.degree in ("determined", "weak")}
+        return frozenset(known | set(stack_identification.read_off))
     narrow = set()
     for name, interval in model.provenance.intervals.items():
         parameter = model.parameter(name)
@@ -84,9 +86,9 @@ def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:
     return [g.name for g in graded if g.degree == degree]
 
 
-def strong_pairs(found: Identification) -> list[tuple[str, str, float]]:
+def strong_pairs(identification: Identification) -> list[tuple[str, str, float]]:
     """Return the pairs of parameters that are known only together, the strongest first."""
-    names, matrix = found.determinacy.names, found.determinacy.correlations
+    names, matrix = identification.determinacy.names, identification.determinacy.correlations
     pairs = [
         (names[i], names[k], float(matrix[i, k]))
         for i in range(len(names))
@@ -149,11 +151,11 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
     """Say which parameters are known only together."""
     if not pairs:
         return f"No two estimates correlate by more than {STRONG_CORRELATION}."
-    shown = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
+    items = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
     more = f", and {len(pairs) - 6} pairs more" if len(pairs) > 6 else ""
     return (
         "Known only together, since one can make up for a change of the other:"
-        f" {', '.join(shown)}{more}."
+        f" {', '.join(items)}{more}."
     )
 
 

@@ -60,8 +60,8 @@ def weight(m: Misfit) -> float:
 
 def strongest(misfits: Sequence[Misfit]) -> Note | None:
     """Return what says most of what is wrong, None if nothing is above the noise."""
-    told = [m for m in misfits if len(m.findings) > 1]
-    return max(told, key=weight).findings[1] if told else None
+    items = [m for m in misfits if len(m.findings) > 1]
+    return max(items, key=weight).findings[1] if items else None
 
 
 MISFIT: Mapping[str, Callable[..., str]] = {

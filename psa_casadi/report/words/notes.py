@@ -65,11 +65,11 @@ def _known_from(places: int) -> str:
     return f"as it was where this voltage was played before, {often}"
 
 
-def _not_shown(shown: float) -> str:
-    if shown > 0.995:
+def _not_shown(value: float) -> str:
+    if value > 0.995:
         return ""
     return (
-        f" The voltage of {100.0 * (1.0 - shown):.0f} % of the samples is not in the reference:"
+        f" The voltage of {100.0 * (1.0 - value):.0f} % of the samples is not in the reference:"
         " they are left out."
     )
 
@@ -318,16 +318,19 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
 }
 
 
-def _identification(found: Identification) -> str:
+def _identification(identification: Identification) -> str:
     """Return the parameters with their standard errors, and what is left of the outputs."""
-    model = found.model
+    model = identification.model
     rows = [
         with_unit(f"  {n} = {model.values[n]:.6g} +- {e:.2g}", model.parameter(n).unit)
-        for n, e in found.errors.items()
+        for n, e in identification.errors.items()
     ]
-    left = [f"  {n}: {v:.3g} rms left, noise {found.noise[n]:.3g}" for n, v in found.rms.items()]
-    said = [f"  {w}" for w in found.warnings]
-    return "\n".join([f"identified '{model.name}':", *rows, *left, *said])
+    left = [
+        f"  {n}: {v:.3g} rms left, noise {identification.noise[n]:.3g}"
+        for n, v in identification.rms.items()
+    ]
+    items = [f"  {w}" for w in identification.warnings]
+    return "\n".join([f"identified '{model.name}':", *rows, *left, *items])
 
 
 def _estimate(value: float, low: float, high: float) -> str:
@@ -448,20 +451,20 @@ class _Words(Formatter):
 _WORDS = _Words()
 
 
-def note_text(said: Note) -> str:
+def note_text(note: Note) -> str:
     """Return the sentence of a note; within a page its lengths are in the page's unit."""
-    return _head(said) + (ENDINGS[said.code](said.values["share"]) if said.code in ENDINGS else "")
+    return _head(note) + (ENDINGS[note.code](note.values["share"]) if note.code in ENDINGS else "")
 
 
-def brief_text(said: Note) -> str:
+def brief_text(note: Note) -> str:
     """Return the sentence of a finding in a residual, with the share it explains in brackets."""
-    if said.code not in ENDINGS:
-        return note_text(said)
-    return f"{_head(said)} ({100.0 * said.values['share']:.0f} % of the excess)."
+    if note.code not in ENDINGS:
+        return note_text(note)
+    return f"{_head(note)} ({100.0 * note.values['share']:.0f} % of the excess)."
 
 
-def _head(said: Note) -> str:
-    sentence = SENTENCES[said.code]
+def _head(note: Note) -> str:
+    sentence = SENTENCES[note.code]
     if isinstance(sentence, str):
-        return _WORDS.vformat(sentence, (), said.values)
-    return sentence(**said.values)
+        return _WORDS.vformat(sentence, (), note.values)
+    return sentence(**note.values)

@@ -77,8 +77,8 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
 def prefixed_scale(largest: float, unit: str) -> Scale:
     """Return a unit with the prefix that makes `largest` a handy number; compounds have none."""
     if unit in _PREFIXED and largest > 0:
-        found = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
-        return Scale(found[0] + unit, 1.0 / found[1])
+        result = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
+        return Scale(result[0] + unit, 1.0 / result[1])
     return Scale("" if unit == "1" else unit, 1.0)
 
 
@@ -174,8 +174,8 @@ _LIKELIHOOD = (
 
 def confidence_text(confidence: float) -> str:
     """Return how sure a cause is, as a number and in words."""
-    shown = round(confidence, 2)
-    words = next((w for least, w in _LIKELIHOOD if shown >= least), "unlikely")
+    displayed = round(confidence, 2)
+    words = next((w for least, w in _LIKELIHOOD if displayed >= least), "unlikely")
     return f"confidence {percent(confidence)}: {words}"
 
 
@@ -194,8 +194,10 @@ def share_text(candidate: Candidate, d: Diagnosis) -> str:
     if len(d.causes) < 2:
         return alone
     named = {c.effect for c in d.causes}
-    own = next((c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None)
-    return alone if own is None else f"{alone}; with others {own.percents[0]} %"
+    item = next(
+        (c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None
+    )
+    return alone if item is None else f"{alone}; with others {item.percents[0]} %"
 
 
 def rest_sentence(d: Diagnosis) -> str:

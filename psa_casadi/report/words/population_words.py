@@ -131,31 +131,46 @@ def population_tables(p: population.Population) -> dict[str, Table]:
     outliers, rows, batches, drifts = [], [], [], []
     for o in p.outliers:
         s, place = spreads[o.parameter], devices[o.device]
-        found, shown = p.findings[place], _Shown(s.estimates)
+        result, displayed = p.findings[place], _Shown(s.estimates)
         mean, half = float(s.common.b[0]), NORMAL_95 * s.common.tau
         theta = float(s.estimates.theta[s.estimates.places.index(place)])
         outliers.append(
-            (o.device, found.batch, found.day.isoformat() if found.day else "", o.parameter,
-             shown.value(theta), shown.interval((mean - half, mean + half)), number(o.z, 3),
+            (o.device, result.batch, result.day.isoformat() if result.day else "", o.parameter,
+             displayed.value(theta), displayed.interval((mean - half, mean + half)), number(o.z, 3),
              _p(o.p_adjusted))
         )  # fmt: skip
     for name, s in spreads.items():
-        c, shown = s.common, _Shown(s.estimates)
+        c, displayed = s.common, _Shown(s.estimates)
         rows.append(
-            (name, str(len(s.estimates.places)), shown.value(float(c.b[0])),
-             shown.interval(c.interval()), shown.spread(c.tau), shown.spreads(c.tau_interval),
-             _p(c.p_value), str(sum(o.parameter == name for o in p.outliers)),
-             _p(p.batch_p.get(name)), _p(p.drift_p.get(name)))
-        )  # fmt: skip
+            (
+                name,
+                str(len(s.estimates.places)),
+                displayed.value(float(c.b[0])),
+                displayed.interval(c.interval()),
+                displayed.spread(c.tau),
+                displayed.spreads(c.tau_interval),
+                _p(c.p_value),
+                str(sum(o.parameter == name for o in p.outliers)),
+                _p(p.batch_p.get(name)),
+                _p(p.drift_p.get(name)),
+            )
+        )
         if s.batches is not None and name in p.batches_differ:
             batches += [
-                (name, b.name, str(b.devices), shown.value(b.mean), shown.interval(b.interval),
-                 shown.spread(b.differs_by), _p(b.p_adjusted))
+                (
+                    name,
+                    b.name,
+                    str(b.devices),
+                    displayed.value(b.mean),
+                    displayed.interval(b.interval),
+                    displayed.spread(b.differs_by),
+                    _p(b.p_adjusted),
+                )
                 for b in s.batches.batches
-            ]  # fmt: skip
+            ]
         if s.drift is not None and name in p.drifting:
-            slope = shown.spread(s.drift.slope)
-            drifts.append((name, slope, shown.spreads(s.drift.interval), _p(p.drift_p[name])))
+            slope = displayed.spread(s.drift.slope)
+            drifts.append((name, slope, displayed.spreads(s.drift.interval), _p(p.drift_p[name])))
     return {
         "outliers": Table(
             ("device", "batch", "date", "parameter", "value", "the others (95 %)", "z",
@@ -191,10 +206,10 @@ def left_out_sentence(p: population.Population) -> str:
 
 
 def difference_sentence(
-    findings: Sequence[Finding], found: Sequence[population.Difference] | None = None
+    findings: Sequence[Finding], differences: Sequence[population.Difference] | None = None
 ) -> str:
     """Say which parameters differ beyond noise, how the verdicts do, and which fits miss."""
-    rows = population.differences(findings) if found is None else found
+    rows = population.differences(findings) if differences is None else differences
     differing = [d.estimates.name for d in rows if d.differs]
     if not rows:
         sentence = "The files share no parameter that two devices determine."
@@ -208,8 +223,8 @@ def difference_sentence(
     else:
         sentence = f"None of the {len(rows)} parameters differs beyond noise."
     if len({f.verdict for f in findings if f.verdict}) > 1:
-        told = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
-        sentence += f" Verdicts differ ({listing(told)})."
+        items = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
+        sentence += f" Verdicts differ ({listing(items)})."
     return " ".join((sentence, *missed_sentences(findings)))
 
 
@@ -228,32 +243,32 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
         ("cause (confidence)", *(causes_text(f) for f in findings)),
     ]
     for output in dict.fromkeys(e.output for f in findings for e in f.errors):
-        found = [next((e for e in f.errors if e.output == output), None) for f in findings]
-        told = [e for e in found if e is not None]
-        own, name = scale, ""
+        items = [next((e for e in f.errors if e.output == output), None) for f in findings]
+        report = [e for e in items if e is not None]
+        item, name = scale, ""
         if output != _LENGTH:
-            own, name = prefixed_scale(max(e.base for e in told), told[0].unit), f"{output}, "
+            item, name = prefixed_scale(max(e.base for e in report), report[0].unit), f"{output}, "
         for head, part in (
             (f"{name}base, held out", "base"),
             (f"{name}extended, held out", "extended"),
             (f"{name}noise", "noise"),
         ):
-            cells = ("" if e is None else number(own.factor * getattr(e, part)) for e in found)
-            columns.append((in_brackets(head, own.unit), *cells))
+            cells = ("" if e is None else number(item.factor * getattr(e, part)) for e in items)
+            columns.append((in_brackets(head, item.unit), *cells))
     fitted = ("" if f.rms_m is None else number(scale.factor * f.rms_m) for f in findings)
     columns.append((f"fitted, rms [{scale.unit}]", *fitted))
     shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
     columns.append(("% of range", *("" if s is None else number(s, 2) for s in shares)))
-    missed = ("" if f.missed is None else number(f.missed, 2) for f in findings)
-    columns.append(("missed, times the noise", *missed))
+    misfit = ("" if f.missed is None else number(f.missed, 2) for f in findings)
+    columns.append(("missed, times the noise", *misfit))
     top, *body = zip(*(c for c in columns if any(c[1:])), strict=True)
     return Table(top, tuple(body))
 
 
 def causes_text(f: Finding) -> str:
     """Return the named causes with their confidence, rivals joined by "or"."""
-    told = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
-    return listing(told)
+    items = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
+    return listing(items)
 
 
 def budget_table(findings: Sequence[Finding]) -> Table:
@@ -271,16 +286,16 @@ def difference_table(findings: Sequence[Finding], rows: Sequence[population.Diff
     """Return the shared parameters with intervals, one device a column, and whether they differ."""
     body = []
     for d in rows:
-        shown, cells = _Shown(d.estimates), []
+        displayed, cells = _Shown(d.estimates), []
         for k, f in enumerate(findings):
-            p = f.parameters.get(shown.name)
+            p = f.parameters.get(displayed.name)
             if p is None or k not in d.estimates.places:
                 cells.append("not determined")
                 continue
-            low, high = map(shown.number, p.interval or (p.value, p.value))
-            cells.append(f"{shown.number(p.value)} ({low} to {high})")
+            low, high = map(displayed.number, p.interval or (p.value, p.value))
+            cells.append(f"{displayed.number(p.value)} ({low} to {high})")
         differ = "yes" if d.differs else "within noise"
-        body.append((shown.name, shown.unit, *cells, _p(d.p_adjusted), differ))
+        body.append((displayed.name, displayed.unit, *cells, _p(d.p_adjusted), differ))
     head = ("parameter", "unit", *(f.device for f in findings), "p, adjusted", "differ")
     return Table(head, tuple(body))
 

@@ -154,14 +154,14 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
         where = listing([number(s.at) for s in sizes])
         text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
     else:
-        seen = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
+        table = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
         still = {s.output for s in sizes if s.value == 0.0} if len(sizes) > 1 else set()
         moves = [
             f"the {plain(o)} by up to {a}"
-            for (test, o), a in seen.items()
+            for (test, o), a in table.items()
             if test == "record" and o not in still
         ]
-        rms = "".join(f", {a} rms" for (test, _), a in seen.items() if test == "rms")
+        rms = "".join(f", {a} rms" for (test, _), a in table.items() if test == "rms")
         text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
     return text
 
@@ -201,19 +201,19 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
         ))  # fmt: skip
     stack = d if isinstance(d, StackDiagnosis) else None
     errors, noise = _sizes(d)
-    commands, beside = _commands(d, model_file)
+    commands, others = _commands(d, model_file)
     if d.verdict == "adequate" and d.doubt:
-        said = "Use the model within these records only: their held-out samples cannot confirm it."
-        return Advice((said,), beside, commands[:1])
+        text = "Use the model within these records only: their held-out samples cannot confirm it."
+        return Advice((text,), others, commands[:1])
     if d.verdict == "adequate":
-        said = (
+        text = (
             f"Use the model: it errs by {errors} on samples that no fit has seen, at a noise of"
             f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
             " are untested."
         )
-        return Advice((said,), beside, commands)
+        return Advice((text,), others, commands)
     if not d.causes:
-        said = (
+        text = (
             f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
             f" error, and {'measure the next record' if stack else _further(d)}."
         )
@@ -223,13 +223,13 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
                 f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
                 " above the noise."
             )
-            beside = (patched, *beside)
-        return Advice((said,), beside, commands)
+            others = (patched, *others)
+        return Advice((text,), others, commands)
     if d.verdict == "partly_explained" and isinstance(d.budget, StackBudget):
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
-        beside = (f"Without an explanation stays {left} rms above the noise.", *beside)
+        others = (f"Without an explanation stays {left} rms above the noise.", *others)
     lines = tuple(_of_cause(c, lambda v: scale_of(d.experiments, v)) for c in d.causes[:_CAUSES])
-    return Advice(lines, (*_rivals(d.causes), *beside), commands)
+    return Advice(lines, (*_rivals(d.causes), *others), commands)
 
 
 def _sizes(d: Diagnosis) -> tuple[str, str]:
@@ -277,16 +277,16 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
         commands.append(
             f"psa design experiment {model} --record RECORD.csv --separate {names} -o NEXT.csv"
         )
-    said = []
+    items = []
     if outside:
         names = listing([plain(c.effect) for c in outside])
-        said.append(f"An exported plant leaves out {names}: correct the reading instead.")
+        items.append(f"An exported plant leaves out {names}: correct the reading instead.")
     if model_file is None:
-        said.append(
+        items.append(
             f"The commands read {file}: write it with -o {file}, in Python with"
             f' psa.save_model(result.model, "{file}").'
         )
-    return tuple(commands), tuple(said)
+    return tuple(commands), tuple(items)
 
 
 def _of_cause(cause: Cause, length: Length) -> str:
@@ -303,12 +303,12 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
         known = [EFFECTS[n] for n in cause.cannot_be_told_from[:_RIVALS] if n in EFFECTS]
         each = [f"{plain(e.name)}: {lowered(DO[e.what_now.code])}" for e in known]
         if each:
-            own = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
-            tests = dict.fromkeys(e.what_now.test for e in (*own, *known))
-            shown = listing([RECORDS[t] for t in tests])
+            item = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
+            tests = dict.fromkeys(e.what_now.test for e in (*item, *known))
+            text = listing([RECORDS[t] for t in tests])
             lines.append(
                 f"The record does not decide; in the place of {plain(cause.effect)} it may be"
-                f" {'; or '.join(each)}. What decides: {shown}."
+                f" {'; or '.join(each)}. What decides: {text}."
             )
         elif cause.cannot_be_told_from:
             lines.append("The records do not decide: record another level, rate or output as well.")

@@ -126,7 +126,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     stack = d if isinstance(d, StackDiagnosis) else None
     count = 1 if stack else len(d.experiments[0].channels)
     noise = {e.output: e.noise for e in d.errors}
-    found = []
+    items = []
     for j in range(count):
         base, extended = d.shown(j)
         for k, e in enumerate(d.experiments):
@@ -135,32 +135,38 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
                 curves.append(Curve("extended model", colours.EXTENDED, extended[k]))
             if stack:
                 level = stack.noise[k].level if stack.noise else stack.noise_floor_rms_m
-                found.append(_displacement(k, e, curves, level))
+                items.append(_displacement(k, e, curves, level))
             else:
-                found += _output(d.model, d.experiments, (k, j), noise, curves)
-    return tuple(found)
+                items += _output(d.model, d.experiments, (k, j), noise, curves)
+    return tuple(items)
 
 
-def series_of_fit(found: Identification) -> tuple[Series, ...]:
+def series_of_fit(identification: Identification) -> tuple[Series, ...]:
     """Return the records of an identification with the fitted model.
 
     The noise of a displacement is that of the residual's fast differences: the level that weighted
     a record in the fit may be its whole residual.
     """
     rows: list[Series] = []
-    if isinstance(found, StackIdentification):
-        predictions = found.fit.predicted(found.experiments)
-        rows_of = zip(found.experiments, predictions, strict=True)
+    if isinstance(identification, StackIdentification):
+        predictions = identification.fit.predicted(identification.experiments)
+        rows_of = zip(identification.experiments, predictions, strict=True)
         for k, (e, predicted) in enumerate(rows_of):
             noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
             rows.append(_displacement(k, e, [Curve("model", colours.EXTENDED, predicted)], noise))
         return tuple(rows)
-    outputs = found.fit.outputs(found.experiments)
-    for j, channel in enumerate(found.experiments[0].channels):
-        place = found.model.output_names.index(channel.column)
+    outputs = identification.fit.outputs(identification.experiments)
+    for j, channel in enumerate(identification.experiments[0].channels):
+        place = identification.model.output_names.index(channel.column)
         for k, y in enumerate(outputs):
             curves = [Curve("model", colours.EXTENDED, y[:, place])]
-            rows += _output(found.model, found.experiments, (k, j), found.noise, curves)
+            rows += _output(
+                identification.model,
+                identification.experiments,
+                (k, j),
+                identification.noise,
+                curves,
+            )
     return tuple(rows)
 
 
@@ -251,8 +257,8 @@ def telling_window(s: Series) -> slice:
                 continue
             y = first.values[part]
             errors = [float(np.sqrt(np.mean(m[part] ** 2))) for m in miss]
-            seen = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
-            score = seen / (float(np.ptp(y)) + 6.0 * s.noise + seen) * width**0.25
+            observed = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
+            score = observed / (float(np.ptp(y)) + 6.0 * s.noise + observed) * width**0.25
             if score > best:
                 best, window = score, part
     return window

@@ -108,7 +108,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def parameter_table(
-    model: Model, found: Identification | None = None, only: Collection[str] | None = None
+    model: Model, identification: Identification | None = None, only: Collection[str] | None = None
 ) -> Table:
     """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
 
@@ -123,16 +123,18 @@ def parameter_table(
             low, high = (convert(v, unit, display) for v in (interval.low, interval.high))
             text = interval_text(low, high)
         value = number(convert(model.values[p.name], unit, display), 4)
-        rows.append((p.name, value, text, display, _status(model, p.name, found), p.description))
+        rows.append(
+            (p.name, value, text, display, _status(model, p.name, identification), p.description)
+        )
     return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
 
 
-def _status(model: Model, name: str, found: Identification | None) -> str:
-    if isinstance(found, StackIdentification) and name in found.read_off:
+def _status(model: Model, name: str, identification: Identification | None) -> str:
+    if isinstance(identification, StackIdentification) and name in identification.read_off:
         return "read off"
     if name not in model.provenance.free:
         return "current" if name in model.provenance.intervals else "not fitted"
-    degree = grade(found, name).degree if found is not None else "determined"
+    degree = grade(identification, name).degree if identification is not None else "determined"
     return "fit" if degree in ("determined", "fixed") else f"fit, {degree}"
 
 
@@ -160,8 +162,8 @@ def error_table(d: Diagnosis, scale: Scale) -> Table:
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
         lengths = (e.train_rms_m, e.holdout_rms_m, e.holdout_max_m)
-        shown = (number(factor * v) for v in lengths)
-        lines.append((name, *shown, number(e.holdout_nrmse_percent)))
+        displayed = (number(factor * v) for v in lengths)
+        lines.append((name, *displayed, number(e.holdout_nrmse_percent)))
     noise = number(factor * d.noise_floor_rms_m)
     lines.append(("noise", noise, noise, "", ""))
     head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
@@ -181,16 +183,16 @@ def record_error_table(series: Sequence[Series]) -> Table:
 
 
 def _falls(
-    what: str, given: Iterable[tuple[str, str, float, float, float]], extended: bool
+    what: str, inputs: Iterable[tuple[str, str, float, float, float]], extended: bool
 ) -> Table:
     """Return rows of a name, unit, noise and two errors, and by how much the error falls."""
     head = (what, "unit", "noise rms", "base, held-out rms")
     rows = []
-    for name, unit, noise, base, after in given:
+    for name, unit, noise, base, after in inputs:
         scale = prefixed_scale(base, unit)
-        shown = [noise, base, *([after] if extended else [])]
+        items = [noise, base, *([after] if extended else [])]
         falls = [f"{100.0 * (1.0 - after / base):.0f} %"] if extended and base > 0 else []
-        rows.append((name, scale.unit, *(number(scale.factor * v) for v in shown), *falls))
+        rows.append((name, scale.unit, *(number(scale.factor * v) for v in items), *falls))
     return _table((*head, *(("extended, held-out rms", "falls by") if extended else ())), rows)
 
 
@@ -199,8 +201,8 @@ def column_table(d: StackDiagnosis) -> Table:
     rows = []
     for c in d.columns:
         errors = (c.noise, c.base_rms, c.extended_rms if added(d) else None)
-        shown = ("" if e is None else number(e) for e in errors)
-        rows.append((c.column, c.role, c.unit, *shown))
+        displayed = ("" if e is None else number(e) for e in errors)
+        rows.append((c.column, c.role, c.unit, *displayed))
     head = ("noise rms", "base, held-out rms", "extended, held-out rms")
     return _table(("column", "used as", "unit", *head), rows)
 
@@ -217,13 +219,13 @@ def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]
     lines = []
     for s, f in zip(series, figures, strict=True):
         scale = scales[s.quantity]
-        shown = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
+        displayed = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
         ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
-        told = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
-        lines.append((s.name, *(() if one else (scale.unit,)), *shown, *told))
+        output = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
+        lines.append((s.name, *(() if one else (scale.unit,)), *displayed, *output))
     lengths = [in_brackets(what, one) for what in ("rms", "largest", "noise")]
-    told = ("rms / noise", "rms [% of range]", "correlation of neighbours")
-    return _table(("record", *(() if one else ("unit",)), *lengths, *told), lines)
+    output = ("rms / noise", "rms [% of range]", "correlation of neighbours")
+    return _table(("record", *(() if one else ("unit",)), *lengths, *output), lines)
 
 
 def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
@@ -239,9 +241,9 @@ def record_table(experiments: "Sequence[Experiment]", origin: str) -> Table:
     """Return the records with their size, how they were used, and their SHA-256."""
     rows = []
     for e in experiments:
-        given = e.record
+        inputs = e.record
         counts = (str(int(part.sum())) for part in (e.used, e.held_out))
-        rows.append((given.name, origin, number(given.duration), *counts, given.sha256))
+        rows.append((inputs.name, origin, number(inputs.duration), *counts, inputs.sha256))
     return _table(
         ("record", "origin", "duration [s]", "samples fitted", "samples held out", "SHA-256"), rows
     )
@@ -266,8 +268,8 @@ def blind_table(d: StackDiagnosis) -> Table:
     rows = []
     for b in blindest(d):
         # a screening without any direction for the effect reports the largest number there is
-        seen = b.smallest_detectable_gain < 1e100
-        size = with_unit(number(b.smallest_detectable_gain), b.unit) if seen else "at no size"
+        observed = b.smallest_detectable_gain < 1e100
+        size = with_unit(number(b.smallest_detectable_gain), b.unit) if observed else "at no size"
         rows.append((plain(b.effect), size, b.why))
     return _table(("effect", "shows from", "why"), rows)
 
@@ -315,9 +317,9 @@ def check_table(report: "CheckReport") -> Table:
     for r in report.rows:
         # where none is allowed it counts problems
         counted = r.limit == 0 and r.figure >= 0
-        found = str(int(r.figure)) if counted else number(r.figure)
+        matches = str(int(r.figure)) if counted else number(r.figure)
         result = "note" if r.noted else "pass" if r.passed else "FAIL"
-        rows.append((r.name, found, number(r.limit), result, r.remark, r.clause))
+        rows.append((r.name, matches, number(r.limit), result, r.remark, r.clause))
     head = ("check", "found", "allowed", "result", "remark", "clause")
     if report.foreign:
         return _table((*head[:1], *head[3:]), [(row[0], *row[3:]) for row in rows])

@@ -86,7 +86,11 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
-        lines += [("kind", said)] if (said := verdict_words.family_sentence(c.families)) else []
+        lines += (
+            [("kind", statement)]
+            if (statement := verdict_words.family_sentence(c.families))
+            else []
+        )
         lines.append(("rivals", _rivals(d, c)))
     if stack:
         columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]
@@ -143,40 +147,48 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
 
 
 def identification_text(
-    found: StackIdentification, *, origin: str = "measured", width: int = 100
+    stack_identification: StackIdentification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
-    scale = scale_of(found.experiments, found.fit.rms)
-    span = max(e.record.range_m for e in found.experiments)
-    share = number(100.0 * found.fit.rms / span, 2)
+    scale = scale_of(stack_identification.experiments, stack_identification.fit.rms)
+    span = max(e.record.range_m for e in stack_identification.experiments)
+    share = number(100.0 * stack_identification.fit.rms / span, 2)
     head = [
-        ("records", _records_text(found.experiments, origin)),
-        ("error", f"{scale.text(found.fit.rms)} rms, {share} % of the largest range"),
+        ("records", _records_text(stack_identification.experiments, origin)),
+        (
+            "error",
+            f"{scale.text(stack_identification.fit.rms)} rms, {share} % of the largest range",
+        ),
     ]
-    tail = [("warning", w) for w in found.warnings]
-    tail += [("open", c.sentence) for c in found.combinations]
-    tail += [("next", a.sentence) for a in found.advice]
-    tail += [("note", n) for n in (*found.sentences, *found.model.provenance.notes)]
-    return _around(head, parameter_table(found.model, found), tail, width)
+    tail = [("warning", w) for w in stack_identification.warnings]
+    tail += [("open", c.sentence) for c in stack_identification.combinations]
+    tail += [("next", a.sentence) for a in stack_identification.advice]
+    tail += [
+        ("note", n)
+        for n in (*stack_identification.sentences, *stack_identification.model.provenance.notes)
+    ]
+    return _around(
+        head, parameter_table(stack_identification.model, stack_identification), tail, width
+    )
 
 
-def fit_sentence(found: Identification) -> str:
+def fit_sentence(identification: Identification) -> str:
     """Say how far a model is from its records."""
     parts = []
-    for name, rms in found.rms.items():
-        unit = next(o.unit for o in found.model.structure.outputs if o.name == name) or "1"
-        noise = found.noise[name]
+    for name, rms in identification.rms.items():
+        unit = next(o.unit for o in identification.model.structure.outputs if o.name == name) or "1"
+        noise = identification.noise[name]
         ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
         parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
     return f"The model misses {listing(parts)} rms."
 
 
 def effect_page(
-    effect: Component, width: int = 100, seen: tuple[Model, Sequence[Size]] | None = None
+    effect: Component, width: int = 100, observed: tuple[Model, Sequence[Size]] | None = None
 ) -> str:
     """Return one effect: what it is, equation, signature, source, what now, parameters.
 
-    `seen` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
+    `observed` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
     """
     lines = [
         ("what", effect.description),
@@ -185,7 +197,7 @@ def effect_page(
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
-    lines += [("how large", effect_size(effect, *seen))] if seen is not None else []
+    lines += [("how large", effect_size(effect, *observed))] if observed is not None else []
     lines += zip(("what now", "record"), effect_advice(effect), strict=True)
     return f"{effect.name}\n\n{_around(lines, effect_parameter_table(effect), (), width)}"
 
@@ -209,11 +221,11 @@ def check_sentence(report: "CheckReport") -> str:
 def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
     """Return the records with their samples, duration and what they are."""
     parts, out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
-    for name, own in in_parts(e.record for e in experiments):
-        held, lasts = sum(out[id(r)] for r in own), sum(r.duration for r in own)
+    for name, item in in_parts(e.record for e in experiments):
+        held, lasts = sum(out[id(r)] for r in item), sum(r.duration for r in item)
         rest = f", {held} of them held out" if held else ""
-        cut = f"{len(own)} parts, " * (len(own) > 1)
-        size = f"{cut}{sum(r.n for r in own)} samples in {number(lasts)} s{rest}"
+        cut = f"{len(item)} parts, " * (len(item) > 1)
+        size = f"{cut}{sum(r.n for r in item)} samples in {number(lasts)} s{rest}"
         parts.append(f"{name} ({origin}: {size})")
     return "; ".join(parts)
 
@@ -227,42 +239,47 @@ def _errors(e: Errors, scale: Scale) -> str:
     )
 
 
-def posterior_table(found: Posterior) -> Table:
+def posterior_table(posterior: Posterior) -> Table:
     """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
     rows = []
-    for f in found.figures:
-        unit, display = shown_in(found.model, f.name)
+    for f in posterior.figures:
+        unit, display = shown_in(posterior.model, f.name)
         mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
         spread = convert(f.mean + f.sd, unit, display) - mean
         interval = f"{number(low, 4)} to {number(high, 4)}"
-        told = (display, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
-        meaning = found.model.parameter(f.name).description
-        rows.append((f.name, number(mean, 4), number(spread), interval, *told, meaning))
+        output = (display, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
+        meaning = posterior.model.parameter(f.name).description
+        rows.append((f.name, number(mean, 4), number(spread), interval, *output, meaning))
     head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
     return Table(head, tuple(rows))
 
 
-def drawn(found: Posterior) -> str:
+def drawn(posterior: Posterior) -> str:
     """Return how much was drawn."""
-    return f"{found.chains} chains of {found.draws} draws, {found.divergences} divergent"
+    return (
+        f"{posterior.chains} chains of {posterior.draws} draws, {posterior.divergences} divergent"
+    )
 
 
-def left_table(found: Posterior) -> Table:
+def left_table(posterior: Posterior) -> Table:
     """Return the rms that the fit leaves of every output of every record, and how many samples."""
     rows = []
-    for b in found.task.density.blocks:
-        e, channel = found.task.experiments[b.record], found.task.channel(b)
-        samples, worth = str(int(e.at(b.channel).sum())), number(b.alike)
-        rows.append((e.record.name, channel.column, number(b.level), channel.unit, samples, worth))
+    for b in posterior.task.density.blocks:
+        e, channel = posterior.task.experiments[b.record], posterior.task.channel(b)
+        samples, gain = str(int(e.at(b.channel).sum())), number(b.alike)
+        rows.append((e.record.name, channel.column, number(b.level), channel.unit, samples, gain))
     head = ("record", "output", "rms left", "unit", "samples", "that count as one")
     return Table(head, tuple(rows))
 
 
-def posterior_text(found: Posterior, *, origin: str = "measured", width: int = 100) -> str:
+def posterior_text(posterior: Posterior, *, origin: str = "measured", width: int = 100) -> str:
     """Return a posterior: records, chains, the parameters, warnings."""
-    head = [("records", _records_text(found.task.experiments, origin)), ("drawn", drawn(found))]
-    tail = [("warning", w) for w in found.warnings] + [("note", n) for n in found.sentences]
-    return _around(head, posterior_table(found), tail, width)
+    head = [
+        ("records", _records_text(posterior.task.experiments, origin)),
+        ("drawn", drawn(posterior)),
+    ]
+    tail = [("warning", w) for w in posterior.warnings] + [("note", n) for n in posterior.sentences]
+    return _around(head, posterior_table(posterior), tail, width)
 
 
 def _around(head: Lines, table: Table, tail: Lines, width: int) -> str:

@@ -40,34 +40,34 @@ def gain_sentence(d: StackDiagnosis) -> str:
     low, high = d.gain.interval
     if gain <= 0:
         return "the held-out error does not fall"
-    told = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
-    if told[1] == "100":
-        told = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
-    return f"the held-out error falls by {told[0]} % (95 % interval {told[1]} to {told[2]} %)"
+    output = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
+    if output[1] == "100":
+        output = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
+    return f"the held-out error falls by {output[0]} % (95 % interval {output[1]} to {output[2]} %)"
 
 
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
     if d.doubt and d.verdict == "adequate":
-        said = f"Nothing beyond the noise is seen to be missing; {d.doubt}"
+        text = f"Nothing beyond the noise is seen to be missing; {d.doubt}"
     elif d.doubt:
-        said = f"Something is missing, and no cause is named; {d.doubt}"
+        text = f"Something is missing, and no cause is named; {d.doubt}"
     elif d.verdict == "adequate":
-        said = f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}"
+        text = f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}"
     elif d.verdict == "not_driven":
-        seen = (
+        observed = (
             "The displacement falls while the voltage rises: correct the sign of one of them."
             " Nothing was diagnosed"
             if doubtful_sign([e.record for e in d.experiments])
             else "The displacement does not follow the voltage: nothing can be diagnosed"
         )
-        said = f"{seen}; {_base_errors(d)}"
+        text = f"{observed}; {_base_errors(d)}"
     elif d.verdict == "unexplained" or not d.causes:
         nothing = "Something is missing, and no effect in the table explains it: no cause is named"
-        said = f"{nothing}; {_without_name(d)}{_base_errors(d)}"
+        text = f"{nothing}; {_without_name(d)}{_base_errors(d)}"
     else:
-        said = _named(d)
-    return f"{said}."
+        text = _named(d)
+    return f"{text}."
 
 
 def _named(d: Diagnosis) -> str:
@@ -132,10 +132,10 @@ def within(share: float) -> float:
 
 def _without_name(d: Diagnosis) -> str:
     """Say what an extended model without a cause holds and would take, "" where nothing."""
-    said, b = "", d.budget
+    text, b = "", d.budget
     if d.kept:
         one = len(d.kept) == 1
-        said = (
+        text = (
             f"{phrases.listing([phrases.plain(name) for name in d.kept])}"
             f" {'removes' if one else 'remove'}"
             f" {phrases.percent(within(b.together.share))} of the error above the noise and"
@@ -145,8 +145,8 @@ def _without_name(d: Diagnosis) -> str:
     if d.patch is not None and b.unnamed is not None:
         more = "a further " if phrases.added(d) else ""
         share = phrases.percent(within(b.unnamed.share))
-        said += f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
-    return said
+        text += f"{d.patch.sentence} would remove {more}{share} of the error above the noise; "
+    return text
 
 
 def named_cause(cause: Cause) -> str:
@@ -301,8 +301,8 @@ def budget_table(d: Diagnosis) -> Table:
     if isinstance(b, StackBudget):
         scale = phrases.scale_of(d.experiments, b.excess_rms_m)
         share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-        shown = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
-        left = (_REMAINS, f"{shown}, {scale.text(b.remains_rms_m)}", "")
+        displayed = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
+        left = (_REMAINS, f"{displayed}, {scale.text(b.remains_rms_m)}", "")
     return Table(("what", "removes", "95 % interval"), (*rows, left))
 
 

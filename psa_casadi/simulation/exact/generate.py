@@ -26,14 +26,14 @@ class Entry:
     index: int
 
 
-def dispatch(name: str, count: int, given: str = _GIVEN) -> str:
+def dispatch(name: str, count: int, text: str = _GIVEN) -> str:
     """Return a function that calls the one with the number it is given."""
-    passed = [q.split()[-1].lstrip("*") for q in given.split(",")]
+    passed = [q.split()[-1].lstrip("*") for q in text.split(",")]
     unused = ", ".join(f"(void){q}" for q in passed)
     calls = ", ".join(passed)
     cases = "".join(f"    case {k}: {name}_{k}({calls}); break;\n" for k in range(count))
     return (
-        f"static inline void {name}(int which, {given}) {{\n    {unused};\n"
+        f"static inline void {name}(int which, {text}) {{\n    {unused};\n"
         f"    switch (which) {{\n{cases}    default: break;\n    }}\n}}\n"
     )
 
@@ -77,7 +77,7 @@ def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int
 
     `d` holds for each chunk the tail's factors, then those of L by its columns.
     """
-    rows, product, own = [*range(len(linear)), *needed], [], []
+    rows, product, item = [*range(len(linear)), *needed], [], []
     for place, i in enumerate(rows):
         inside = place - len(linear)
         factors = [
@@ -89,17 +89,17 @@ def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int
     for first in range(0, len(rows), CHUNK):
         chunk = range(first, min(first + CHUNK, len(rows)))
         entries = [(r, j) for j in range(len(reach)) for r in chunk if reach[rows[r], j]]
-        own += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
-        own += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
-        own += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
-        own += ["        }"]
-        own += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
-        own += [f"        d += {len(entries)};"]
-        own += [*(f"        out[{r}] += a{r};" for r in chunk), "    }"]
-    given = "const real *f, const real *const *half, const column *x, column *out"
+        item += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
+        item += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
+        item += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
+        item += ["        }"]
+        item += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
+        item += [f"        d += {len(entries)};"]
+        item += [*(f"        out[{r}] += a{r};" for r in chunk), "    }"]
+    text = "const real *f, const real *const *half, const column *x, column *out"
     last = "const real *l, const double *tail, int tails, const column *d, column *out"
-    lines = [f"static inline void ex_linear_columns({given}) {{", "    (void)half;", *product, "}"]
-    lines += [f"static inline void ex_own_columns({last}) {{", *own, "}"]
+    lines = [f"static inline void ex_linear_columns({text}) {{", "    (void)half;", *product, "}"]
+    lines += [f"static inline void ex_own_columns({last}) {{", *item, "}"]
     return sensitive("\n".join([*lines, ""]))
 
 
@@ -121,12 +121,12 @@ def generate(split: Split, outputs: Sequence[str]) -> str:
     group_size, rate_size = _groups(split, printer, rate)
     port_size = _ports(split, printer, tables)
     names = [o.name for o in s.outputs]
-    shown = [s.y[names.index(n)] for n in outputs]
-    partials, entries = _partials(split, shown, None)
+    displayed = [s.y[names.index(n)] for n in outputs]
+    partials, entries = _partials(split, displayed, None)
     printer.function("ex_outputs", [s.y])
-    printer.function("ex_shown", shown)
-    printer.function("ex_shown_slopes", [*shown, *partials])
-    rule = chain("ex_shown_chain_0", entries, len(shown))
+    printer.function("ex_shown", displayed)
+    printer.function("ex_shown_slopes", [*displayed, *partials])
+    rule = chain("ex_shown_chain_0", entries, len(displayed))
     printer.functions.append(chains("ex_shown_chain", [rule]))
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
@@ -138,8 +138,8 @@ def generate(split: Split, outputs: Sequence[str]) -> str:
         "EX_NP": len(s.parameters), "EX_NY": len(s.outputs), "EX_NG": len(split.groups),
         "EX_NPORT": len(split.ports), "EX_NCH": len(chords), "EX_NTHETA": len(thetas),
         "EX_NK": kept, "EX_NITEMS": len(split.order), "EX_GROUP_OUT": group_size,
-        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_NSHOWN": len(shown),
-        "EX_SHOWN_OUT": len(shown) + len(entries), "EX_NRATED": printer.rated,
+        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_NSHOWN": len(displayed),
+        "EX_SHOWN_OUT": len(displayed) + len(entries), "EX_NRATED": printer.rated,
         "EX_CONSTANT": int(not c.is_zero()),
         "EX_NLOOP": sum(kind == "loop" for kind, _ in split.order),
     }  # fmt: skip
@@ -216,7 +216,7 @@ def _partials(
     """Return the partial derivatives that are not zero, with their entries."""
     s = split.structure
     sources = [(0, s.x), (1, rate), (2, s.p)]
-    found, entries = [], []
+    result, entries = [], []
     for row, expression in enumerate(rows):
         for kind, by in sources:
             if by is None:
@@ -224,9 +224,9 @@ def _partials(
             slopes = ca.jacobian(expression, by)
             for k in range(by.numel()):
                 if slopes.sparsity().has_nz(0, k):
-                    found.append(slopes[0, k])
+                    result.append(slopes[0, k])
                     entries.append(Entry(row, kind, k))
-    return found, entries
+    return result, entries
 
 
 _OF_RATE = "real w, real *k"

@@ -51,12 +51,12 @@ class Graph:
         """Return the number of a node, a new one where no equal one is there."""
         if node not in self.numbers:
             leaf = node[0] in LEAVES
-            given = [] if leaf else [int(a) for a in node[1:]]
+            inputs = [] if leaf else [int(a) for a in node[1:]]
             self.numbers[node] = len(self.nodes)
             self.nodes.append(node)
-            self.fixed.append(node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in given))
+            self.fixed.append(node[0] in ("p", "c") if leaf else all(self.fixed[a] for a in inputs))
             self.rated.append(
-                node[0] in ("p", "c", "w") if leaf else all(self.rated[a] for a in given)
+                node[0] in ("p", "c", "w") if leaf else all(self.rated[a] for a in inputs)
             )
         return self.numbers[node]
 
@@ -101,7 +101,7 @@ class Graph:
         whole = ca.cse([ca.densify(ca.vertcat(*[ca.vec(ca.SX(o)) for o in outputs]))])
         function = ca.Function("f", list(arguments.values()), whole)
         slots: dict[int, int] = {}
-        found = [0] * function.numel_out(0)
+        numbers = [0] * function.numel_out(0)
         for k in range(function.n_instructions()):
             op = function.instruction_id(k)
             if op == ca.OP_CONST:
@@ -112,11 +112,11 @@ class Graph:
                 argument, element = function.instruction_input(k)
                 slots[function.instruction_output(k)[0]] = self.add(names[argument], element)
             elif op == ca.OP_OUTPUT:
-                found[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
+                numbers[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
             else:
-                given = [slots[a] for a in function.instruction_input(k)]
-                slots[function.instruction_output(k)[0]] = self.operation(op, *given)
-        return found
+                items = [slots[a] for a in function.instruction_input(k)]
+                slots[function.instruction_output(k)[0]] = self.operation(op, *items)
+        return numbers
 
     def _times(self, a: int, b: int) -> int:
         return b if self.value(a) == 1.0 else self.add("*", a, b)
@@ -172,10 +172,10 @@ class Graph:
         if node[0] == "neg":
             symbol, factor, shift = self._affine(node[1])
             return symbol, -factor, -shift
-        found = None
+        affine = None
         if node[0] in BINARY.values():
-            found = _combined(node[0], self._affine(node[1]), self._affine(node[2]))
-        return found or (number, 1.0, 0.0)
+            affine = _combined(node[0], self._affine(node[1]), self._affine(node[2]))
+        return affine or (number, 1.0, 0.0)
 
 
 def _combined(operation: str, a: _Affine, b: _Affine) -> _Affine | None:
@@ -233,9 +233,9 @@ class Printer:
 
         It stands in `k` behind what depends on the parameters alone.
         """
-        own, self._own_rated = self._own_rated, []
-        lines = self._body(own, fixed=False, rated=True)
-        lines += [f"    k[EX_NK + {self._rated[n]}] = s{n};" for n in own]
+        item, self._own_rated = self._own_rated, []
+        lines = self._body(item, fixed=False, rated=True)
+        lines += [f"    k[EX_NK + {self._rated[n]}] = s{n};" for n in item]
         head = f"static inline void {name}(real w, real *k) {{"
         self.functions.append("\n".join([head, "    (void)w, (void)k;", *lines, "}", ""]))
 
@@ -259,8 +259,8 @@ class Printer:
         while stack:
             n = stack.pop()
             node = self._graph.nodes[n]
-            told = (self._graph.rated[n] and not rated) or self._graph.fixed[n]
-            if n in needed or node[0] in LEAVES or (told and not fixed):
+            output = (self._graph.rated[n] and not rated) or self._graph.fixed[n]
+            if n in needed or node[0] in LEAVES or (output and not fixed):
                 continue
             needed.add(n)
             stack += [int(a) for a in node[1:]]

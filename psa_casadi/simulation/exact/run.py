@@ -83,8 +83,8 @@ class ExactSteps:
 
 def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
     """Return why outputs of a model cannot be had by exact steps; None if they can."""
-    found = _unfit(structure, outputs) or _compiled(structure, outputs, 1)
-    return found if isinstance(found, str) else None
+    result = _unfit(structure, outputs) or _compiled(structure, outputs, 1)
+    return result if isinstance(result, str) else None
 
 
 def _unfit(structure: Structure, outputs: tuple[str, ...]) -> str | None:
@@ -140,8 +140,8 @@ def time_steps(t: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
         return np.array([mean]), np.zeros(steps.size, np.int32)
     order = np.argsort(steps, kind="stable")
     sizes = steps[order]
-    begins = np.concatenate([[True], np.diff(sizes) > ALIKE * sizes[1:]])
-    groups = np.cumsum(begins) - 1
+    starts = np.concatenate([[True], np.diff(sizes) > ALIKE * sizes[1:]])
+    groups = np.cumsum(starts) - 1
     count = int(groups[-1]) + 1
     if count > LENGTHS:
         raise NotExact(f"the record has {count} different time steps")
@@ -208,13 +208,13 @@ def run_sets(
     `x0` and `nominal` are (nx, m). Every column has the bits of a run by itself; one that cannot be
     integrated is nan from there on. Raises NotExact like `run_exact`.
     """
-    shown = np.empty((len(t), p.shape[1]))
-    arrays = {"p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal), "shown": shown}
+    values = np.empty((len(t), p.shape[1]))
+    arrays = {"p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal), "shown": values}
     _run(
         structure, (output,), (t, u, hold), arrays, lanes=LANES, sets=p.shape[1],
         tolerance=tolerance, steps_limit=MOST_IN_LANES * len(t),
     )  # fmt: skip
-    return shown
+    return values
 
 
 def _run(
@@ -237,11 +237,11 @@ def _run(
     count_run(differentiated=count > 0)
     lengths, which_step = time_steps(t)
     times = {"t": doubles(t), "v": doubles(u), "length": lengths}
-    given: dict[str, npt.NDArray[Any]] = {**times, "which_step": which_step, **arrays}
+    table: dict[str, npt.NDArray[Any]] = {**times, "which_step": which_step, **arrays}
     request = _Request(
         samples=len(t), zero_order_hold=int(hold == "zero"), lengths=len(lengths), sets=sets,
         count=count, coarsest=coarsest, finest=max(FINEST, coarsest), stop=flag_address(), **how,
-        **{name: array.ctypes.data for name, array in given.items()},
+        **{name: array.ctypes.data for name, array in table.items()},
     )  # fmt: skip
     status = _library(structure, outputs, lanes).psa_run_exact(ctypes.byref(request))
     count_steps((request.steps + request.rejected) * (1 + count))

@@ -81,8 +81,8 @@ def along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Expr
             continue
         resting = ca.substitute(slope, rate, ca.SX(0))
         everything = ca.vertcat(s.x[list(others(s, i))], s.u, s.time)
-        own = ca.jacobian(resting, s.x[i])
-        if not ca.depends_on(resting, everything) and not ca.depends_on(own, s.x[i]):
+        item = ca.jacobian(resting, s.x[i])
+        if not ca.depends_on(resting, everything) and not ca.depends_on(item, s.x[i]):
             return driver, rate, slope
     return None
 
@@ -102,14 +102,14 @@ def _resolved(s: Structure, expression: Expression, keep: set[str]) -> Expressio
     return result
 
 
-def groups_along(found: Mapping[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
+def groups_along(table: Mapping[int, tuple[int, Expression, Expression]]) -> tuple[Group, ...]:
     """Return the states with driver, rate symbol and slope (`along`), one group for a driver."""
-    drivers = sorted({driver for driver, *_ in found.values()})
+    drivers = sorted({driver for driver, *_ in table.values()})
     groups = []
     for driver in drivers:
-        states = tuple(i for i, (d, *_) in found.items() if d == driver)
-        rate = found[states[0]][1]
-        slopes = [ca.substitute(found[i][2], found[i][1], rate) for i in states]
+        states = tuple(i for i, (d, *_) in table.items() if d == driver)
+        rate = table[states[0]][1]
+        slopes = [ca.substitute(table[i][2], table[i][1], rate) for i in states]
         groups.append(Group(driver, states, rate, ca.vertcat(*slopes)))
     return tuple(groups)
 
@@ -152,12 +152,12 @@ def order_of(
     for kind, members in items:
         if kind == "group":
             group = groups[members[0]]
-            inside, own = np.any(dependence(group.slopes, s.x), axis=0), list(group.states)
-            read = [*(j for j in np.flatnonzero(inside).tolist() if j not in own), group.driver]
+            inside, item = np.any(dependence(group.slopes, s.x), axis=0), list(group.states)
+            read = [*(j for j in np.flatnonzero(inside).tolist() if j not in item), group.driver]
         else:
             inside = np.any([dependence(ports[k].value, s.x)[0] for k in members], axis=0)
-            own, read = [ports[k].state for k in members], np.flatnonzero(inside).tolist()
-        feeds.append(own)
+            item, read = [ports[k].state for k in members], np.flatnonzero(inside).tolist()
+        feeds.append(item)
         reads.append(read)
     waiting, done = list(range(len(items))), []
     while waiting:
@@ -227,10 +227,10 @@ def _split(s: Structure) -> Split:
         i for i in range(len(s.states)) if ca.depends_on(ca.jacobian(s.xdot[i], every), every)
     ]
     alone = [i for i in moving if not any(reach[i, j] and reach[j, i] for j in others(s, i))]
-    found = {i: g for i in alone if (g := along(s, i, reach)) is not None}
-    groups = groups_along(found)
+    table = {i: g for i in alone if (g := along(s, i, reach)) is not None}
+    groups = groups_along(table)
     # what feeds comes before what it feeds: M is block triangular
-    rest = (i for i in range(len(s.states)) if i not in found)
+    rest = (i for i in range(len(s.states)) if i not in table)
     linear = tuple(sorted(rest, key=lambda i: (int(reach[i].sum()), i)))
     matrices, remainders = _linear_part(s, linear)
     ports = _ports(s, linear, remainders, groups, reach)
@@ -249,17 +249,17 @@ def jumping(s: Structure, of: Expression) -> set[tuple[int, int]]:
     """
     equations = ca.Function("f", s.arguments, [of])
     reads: dict[int, set[tuple[int, int]]] = {}
-    found: set[tuple[int, int]] = set()
+    result: set[tuple[int, int]] = set()
     for k in range(equations.n_instructions()):
-        op, given = equations.instruction_id(k), equations.instruction_input(k)
+        op, inputs = equations.instruction_id(k), equations.instruction_input(k)
         if op == ca.OP_INPUT:
-            read = {(given[0], given[1])}
+            read = {(inputs[0], inputs[1])}
         else:
-            read = set() if op == ca.OP_OUTPUT else set().union(*(reads[q] for q in given))
-        found |= read if op in _JUMPS else set()
+            read = set() if op == ca.OP_OUTPUT else set().union(*(reads[q] for q in inputs))
+        result |= read if op in _JUMPS else set()
         for slot in equations.instruction_output(k) if op != ca.OP_OUTPUT else ():
             reads[slot] = read
-    return found
+    return result
 
 
 def _linear_part(
@@ -272,20 +272,20 @@ def _linear_part(
     origin = ca.SX.zeros(everything.numel())
     blocks = [ca.jacobian(xdot, x), ca.jacobian(xdot, s.u), xdot]
     m, b, c = (ca.densify(q) for q in ca.substitute(blocks, [everything], [origin]))
-    given, coefficients = ca.vertcat(x, s.u), ca.horzcat(m, b)
+    inputs, coefficients = ca.vertcat(x, s.u), ca.horzcat(m, b)
     remainders = []
     for k in range(len(rows)):
         # where the row is affine in a variable, this is taken out by setting it to 0, so that
         # nothing cancels in numbers
-        slopes, of_row = ca.jacobian(xdot[k], given), coefficients[k, :].T
+        slopes, of_row = ca.jacobian(xdot[k], inputs), coefficients[k, :].T
         turns = {len(rows) + j for argument, j in jumping(s, xdot[k]) if argument == _INPUT}
         bent = [
-            j for j in range(given.numel()) if j in turns or ca.depends_on(slopes[j], everything)
+            j for j in range(inputs.numel()) if j in turns or ca.depends_on(slopes[j], everything)
         ]
-        straight = [j for j in range(given.numel()) if j not in bent]
-        rest = ca.substitute(xdot[k], given[straight], ca.SX.zeros(len(straight)))
+        straight = [j for j in range(inputs.numel()) if j not in bent]
+        rest = ca.substitute(xdot[k], inputs[straight], ca.SX.zeros(len(straight)))
         if ca.depends_on(rest, everything):
-            remainders.append(rest - c[k] - (of_row[bent].T @ given[bent] if bent else 0))
+            remainders.append(rest - c[k] - (of_row[bent].T @ inputs[bent] if bent else 0))
         else:
             remainders.append(ca.SX(0))
     return (m, b, c), remainders

@@ -55,9 +55,9 @@ EMULATED = (*_EMULATORS, "x86_64-windows")
 def tool(*names: str) -> str:
     """Return the path of the first program found; skips the test, or fails it if required."""
     for name in names:
-        found = shutil.which(name) or shutil.which(_ELSEWHERE.get(name, name))
-        if found:
-            return found
+        text = shutil.which(name) or shutil.which(_ELSEWHERE.get(name, name))
+        if text:
+            return text
     return _missing(f"{' or '.join(names)} is not installed", names)
 
 
@@ -157,10 +157,10 @@ def emulated(name: str) -> Runner:
     """Return the way to run the programs of another platform; skips where there is none."""
     if name in _EMULATORS:
         emulator, libraries = _EMULATORS[name]
-        found = tool(emulator)
+        text = tool(emulator)
         if not (Path(libraries) / "lib" / "libc.so.6").exists():
             _missing(f"{libraries} has no C library for {emulator}", [emulator])
-        return Runner(PLATFORMS[name], (found, "-L", libraries))
+        return Runner(PLATFORMS[name], (text, "-L", libraries))
     prefix = str(Path(_FOLDER.name) / "wine")
     quiet = {"WINEPREFIX": prefix, "WINEDEBUG": "-all", "WINEDLLOVERRIDES": "mscoree,mshtml="}
     return Runner(PLATFORMS[name], (tool("wine64", "wine"),), tuple(quiet.items()))

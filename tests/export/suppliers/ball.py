@@ -12,10 +12,10 @@ class Ball(Fmi3Slave):  # type: ignore[misc]
     def __init__(self, **words: Any) -> None:
         super().__init__(**words)
         self.time, self.h, self.v, self.g, self.e = 0.0, 1.0, 0.0, 9.81, 0.7
-        told, moves = Fmi3Causality, Fmi3Variability.continuous
-        fixed = {"causality": told.parameter, "variability": Fmi3Variability.tunable}
-        self.register_variable(Float64("time", causality=told.independent, variability=moves))
-        self.register_variable(Float64("h", causality=told.output, variability=moves))
+        output, moves = Fmi3Causality, Fmi3Variability.continuous
+        fixed = {"causality": output.parameter, "variability": Fmi3Variability.tunable}
+        self.register_variable(Float64("time", causality=output.independent, variability=moves))
+        self.register_variable(Float64("h", causality=output.output, variability=moves))
         self.register_variable(Float64("g", start=9.81, **fixed))
         self.register_variable(Float64("e", start=0.7, **fixed))
 

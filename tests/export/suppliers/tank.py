@@ -14,12 +14,12 @@ class Tank(Fmi2Slave):  # type: ignore[misc]
         super().__init__(**words)
         self.inflow, self.valve, self.level = 0.0, True, 0.2
         self.area, self.outlet = 0.5, 0.01
-        told, tunable = Fmi2Causality, {"variability": Fmi2Variability.tunable}
-        self.register_variable(Real("inflow", causality=told.input))
-        self.register_variable(Boolean("valve", causality=told.input))
-        self.register_variable(Real("level", causality=told.output))
-        self.register_variable(Real("area", causality=told.parameter, **tunable))
-        self.register_variable(Real("outlet", causality=told.parameter, **tunable))
+        output, tunable = Fmi2Causality, {"variability": Fmi2Variability.tunable}
+        self.register_variable(Real("inflow", causality=output.input))
+        self.register_variable(Boolean("valve", causality=output.input))
+        self.register_variable(Real("level", causality=output.output))
+        self.register_variable(Real("area", causality=output.parameter, **tunable))
+        self.register_variable(Real("outlet", causality=output.parameter, **tunable))
 
     def do_step(self, _: float, step_size: float) -> bool:
         """Take steps of 50 ms at most, by the midpoint rule."""

@@ -48,13 +48,13 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 def chosen_cases(step: int) -> list[Case]:
     """Return the cases that are repeated, every so manyth of those of the whole benchmark."""
-    seen: Counter[str] = Counter()
+    counter: Counter[str] = Counter()
     kept = []
     for case in study(KNOWN, FOREIGN, 1, FIRST):
         every = _EVERY.get(case.kind)
-        if every is not None and seen[case.kind] % (every * step) == 0:
+        if every is not None and counter[case.kind] % (every * step) == 0:
             kept.append(case)
-        seen[case.kind] += 1
+        counter[case.kind] += 1
     return kept
 
 
@@ -81,15 +81,15 @@ def several_table(found: Mapping[str, Sequence[Found]]) -> TitledTable:
     """Return what the method and the search one by one say of several causes at once."""
     rows = []
     for name, of in found.items():
-        own = [f for f in of if f.reached]
-        ratios = [f.ratio for f in own]
+        items = [f for f in of if f.reached]
+        ratios = [f.ratio for f in items]
         rows.append({
             "method": name,
-            "all in the sets": share(set(f.case.hidden) <= set(f.within) for f in own),
-            "all named, no other": share(set(f.named) == set(f.case.hidden) for f in own),
+            "all in the sets": share(set(f.case.hidden) <= set(f.within) for f in items),
+            "all named, no other": share(set(f.named) == set(f.case.hidden) for f in items),
             "held-out rms over the noise's: mean, largest": f"{np.mean(ratios):.3f},"
             f" {max(ratios):.2f}",
-            "s each": f"{np.mean([f.seconds for f in own]):.0f}",
+            "s each": f"{np.mean([f.seconds for f in items]):.0f}",
         })  # fmt: skip
     return TitledTable("Two and three causes", rows)
 
@@ -114,10 +114,10 @@ def _said(name: str, found: Sequence[Found], whole: Sequence[Found]) -> dict[str
     def of(*kinds: str) -> list[Found]:
         return [f for f in found if f.case.kind in kinds]
 
-    def count(holds: Callable[[Found], bool], own: Sequence[Found]) -> str:
-        return f"{sum(map(holds, own))} of {len(own)}"
+    def count(holds: Callable[[Found], bool], founds: Sequence[Found]) -> str:
+        return f"{sum(map(holds, founds))} of {len(founds)}"
 
-    shown = [f for f in of("known", "weak", "two") if f.reached]
+    items = [f for f in of("known", "weak", "two") if f.reached]
     absent = [f.patched for f in of("foreign", "left out") if f.verdict == "unexplained"]
     other = [
         a.verdict != b.verdict or set(a.within) != set(b.within)
@@ -125,8 +125,8 @@ def _said(name: str, found: Sequence[Found], whole: Sequence[Found]) -> dict[str
     ]
     return {
         "method": name,
-        "right in the set": count(lambda f: set(f.case.hidden) <= set(f.within), shown),
-        "right alone": count(lambda f: f.right_alone, shown),
+        "right in the set": count(lambda f: set(f.case.hidden) <= set(f.within), items),
+        "right alone": count(lambda f: f.right_alone, items),
         "wrong alone": count(lambda f: f.alone not in (None, *f.case.hidden), found),
         "clean named": count(lambda f: bool(f.named), of("clean", "ringing")),
         "port of the patch removes": f"{100.0 * np.median(absent or [0.0]):.0f} % of {len(absent)}",

@@ -41,20 +41,20 @@ def on_dask(
     with dask_client(LOCAL, workers) as client:
         before: set[int] = set(client.run(os.getpid).values())
 
-        def say(told: str) -> None:
+        def say(text: str) -> None:
             nonlocal done
-            progress(told)
-            done += " devices" in told
+            progress(text)
+            done += " devices" in text
             if kill and 3 * done >= devices and not killed:
                 killed.append(min(before))
                 os.kill(killed[0], signal.SIGKILL)
 
-        found = psa.batch(records, output, executor=client, progress=say)
+        result = psa.batch(records, output, executor=client, progress=say)
         after = set(client.run(os.getpid).values())
     if kill and sorted(before - after) != killed:
         raise RuntimeError(f"Workers {killed} were killed, and {before - after} are gone.")
     new = len(after - before)
-    return found, f", {len(killed)} worker killed, {new} new in its place" if kill else ""
+    return result, f", {len(killed)} worker killed, {new} new in its place" if kill else ""
 
 
 #: Samples of a record, time between them [s], noise over the stroke.
@@ -84,7 +84,7 @@ def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> dic
     swing = (1.0 - np.cos(4.0 * np.pi * times)) * np.exp(-0.25 * times)
     bad = dict(zip(sorted(rng.choice(count, defects, replace=False).tolist()),
                    list(DEFECTS) * count, strict=False))  # fmt: skip
-    found, rows = {}, ["device,batch,date,files"]
+    texts, rows = {}, ["device,batch,date,files"]
     for k in range(count):
         force, wide, skew, bend = np.exp(SPREAD * rng.standard_normal(4)).tolist()
         stack = _hysteresis(usual, wide)
@@ -98,9 +98,9 @@ def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> dic
         noise = NOISE * usual.stroke * rng.standard_normal(SAMPLES)
         write_csv(folder / f"{name}.csv", times, run.command, run.displacement + noise)
         rows.append(f"{name},B{k * 10 // count},2026-{k * 12 // count + 1:02d}-15,{name}.csv")
-        found[name] = defect
+        texts[name] = defect
     (folder / "jobs.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    return found
+    return texts
 
 
 def _hysteresis(s: Stack, factor: float) -> Stack:
@@ -170,11 +170,11 @@ def _measured(by: str, work: Callable[[], tuple[psa.BatchRun, str]]) -> _Cost:
         return sum(r.ru_utime + r.ru_stime for r in map(resource.getrusage, who))
 
     before, began = processor(), time.perf_counter()
-    found, remark = work()
+    result, remark = work()
     wall, spent = time.perf_counter() - began, processor() - before
     memory = (resource.getrusage(w).ru_maxrss / 1024.0 for w in who)
-    count = len(found.devices)
-    return _Cost(f"{count} devices, {by}{remark}", found, wall, spent, spent / count, *memory)
+    count = len(result.devices)
+    return _Cost(f"{count} devices, {by}{remark}", result, wall, spent, spent / count, *memory)
 
 
 def _cost(costs: Sequence[_Cost]) -> TitledTable:
@@ -203,19 +203,19 @@ def _roc(devices: Mapping[str, str], found: Population) -> TitledTable:
         for k, p in zip(s.estimates.places, s.far.p, strict=True):
             name = found.findings[k].device
             smallest[name] = min(smallest[name], float(p))
-    told = {o.device for o in found.outliers}
+    output = {o.device for o in found.outliers}
     groups = {"any": [n for n, defect in devices.items() if defect]}
     groups |= {kind: [n for n, defect in devices.items() if defect == kind] for kind in DEFECTS}
     sound = [name for name, defect in devices.items() if not defect]
     rows = []
-    for kind, own in groups.items():
-        auc, error = _auc(*([-smallest[n] for n in names] for names in (own, sound)))
-        rows.append({"defect": kind, "told": share(n in told for n in own),
+    for kind, item in groups.items():
+        auc, error = _auc(*([-smallest[n] for n in names] for names in (item, sound)))
+        rows.append({"defect": kind, "told": share(n in output for n in item),
                      "area under the ROC curve": f"{auc:.3f} ± {1.96 * error:.3f}"})  # fmt: skip
     return TitledTable(
         f"Defects among {len(devices)} devices",
         rows,
-        f"False alarms: {share(n in told for n in sound)} of the sound devices."
+        f"False alarms: {share(n in output for n in sound)} of the sound devices."
         " Told: p below 0.05, adjusted by Benjamini and Hochberg over all devices and parameters."
         " The area under the ROC curve is of the smallest p of a device (interval: Hanley and"
         " McNeil 1982).",

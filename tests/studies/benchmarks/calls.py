@@ -27,20 +27,20 @@ _VARIABLE = "FMU_CALLS"
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Log the calls of every importer that is there."""
-    tables, seen = [], list[Row]()
+    tables, observed = [], list[Row]()
     for name, importer in _IMPORTERS.items():
         progress(name)
         lines = _logged(name, importer)
         if not lines:
-            seen.append({"importer": name} | dict.fromkeys(_HEADS, "not installed"))
+            observed.append({"importer": name} | dict.fromkeys(_HEADS, "not installed"))
             continue
         if len(lines) == 1:
-            seen.append({"importer": name} | dict.fromkeys(_HEADS, "-") | {"read": lines[0]})
+            observed.append({"importer": name} | dict.fromkeys(_HEADS, "-") | {"read": lines[0]})
             continue
-        seen.append({"importer": name, **_told(lines)})
+        observed.append({"importer": name, **_told(lines)})
         rows = [{"call": line} for line in _shortened(lines)]
         tables.append(TitledTable(name, rows))
-    what = TitledTable("The input u = t in the step from 0.1 s to 0.2 s", seen)
+    what = TitledTable("The input u = t in the step from 0.1 s to 0.2 s", observed)
     return Outcome([what] if quick else [what, *tables])
 
 
@@ -76,8 +76,8 @@ def _told(lines: list[str]) -> Row:
     else:
         times = [k for k, w in enumerate(after) if w == "SetTime 0.1"]
         ends = [k for k, w in enumerate(after) if w == "SetTime 0.2"]
-        asked = [w for w in after[times[-1] : ends[0]] if w.startswith("GetDer")]
-        in_step, read = list(dict.fromkeys(asked)), []
+        items = [w for w in after[times[-1] : ends[0]] if w.startswith("GetDer")]
+        in_step, read = list(dict.fromkeys(items)), []
     of = {"before initialization": lines[:enter], "in it": lines[enter:leave]}
     return {
         **{k: _join([w for w in part if w.startswith("Set u")]) for k, part in of.items()},
@@ -92,14 +92,14 @@ def _join(words: list[str]) -> str:
 
 def _shortened(lines: list[str]) -> list[str]:
     """Return the calls up to the end of the second step, without repeats."""
-    found, steps = list[str](), 0
+    texts, steps = list[str](), 0
     for line in lines:
         steps += line.startswith("DoStep")
-        if steps > 2 or len(found) > 40:
+        if steps > 2 or len(texts) > 40:
             break
-        if not found or found[-1] != line:
-            found.append(line)
-    return found
+        if not texts or texts[-1] != line:
+            texts.append(line)
+    return texts
 
 
 def _fmpy(path: Path, **words: Any) -> None:
@@ -116,9 +116,9 @@ def _ours(path: Path, interface: int) -> None:
     wanted = Run(
         str(path), digest_of(path), interface, ("u",), ("y",), {}, times, times[:, None], "linear"
     )
-    found = play(wanted)
-    if isinstance(found, str):
-        raise PsaError(found)
+    result = play(wanted)
+    if isinstance(result, str):
+        raise PsaError(result)
 
 
 def _libcosim(path: Path) -> None:

@@ -52,20 +52,22 @@ def stability(progress: Progress, quick: bool) -> Outcome:
     jobs += [("exam", record, 1 if quick else EXAM_DRAWS) for record in exam]
     jobs += [("measured", row, 1 if quick else MEASURED_DRAWS) for row in MEASURED]
     draws = [(source, k) for _, source, n in jobs for k in range(n + 1)]
-    told = lambda s: f"{s[0]} {', '.join(s[1])}"  # noqa: E731
-    said = iter(on_all_cores(said_of, draws, progress, told))
-    found = {(kind, k): list(itertools.islice(said, n + 1)) for k, (kind, _, n) in enumerate(jobs)}
+    output = lambda s: f"{s[0]} {', '.join(s[1])}"  # noqa: E731
+    statement = iter(on_all_cores(said_of, draws, progress, output))
+    table = {
+        (kind, k): list(itertools.islice(statement, n + 1)) for k, (kind, _, n) in enumerate(jobs)
+    }
     rows = []
-    for kind in (*dict.fromkeys(kind for kind, _ in found), "all"):
-        own = [of for (name, _), of in found.items() if kind in (name, "all")]
-        pairs = [(first, s) for first, *changed in own for s in changed]
+    for kind in (*dict.fromkeys(kind for kind, _ in table), "all"):
+        items = [of for (name, _), of in table.items() if kind in (name, "all")]
+        pairs = [(first, s) for first, *changed in items for s in changed]
         rows.append({
-            "cases": kind, "number": len(own),
+            "cases": kind, "number": len(items),
             "same verdict and names": share(s[:2] == first[:2] for first, s in pairs),
             "same verdict, names in the set": share(
                 s[0] == first[0] and first[1] <= s[2] for first, s in pairs
             ),
-            "cases without a change": sum(len({s[:2] for s in of}) == 1 for of in own),
+            "cases without a change": sum(len({s[:2] for s in of}) == 1 for of in items),
         })  # fmt: skip
     note = "Everything is diagnosed as it is, and with white noise of 1 % of its own added."
     return Outcome([TitledTable("Data changed by 1 % of their noise", rows, note)])
@@ -76,8 +78,8 @@ def chosen_cases(count: int) -> list[Case]:
     every = study(KNOWN, FOREIGN, 2, FIRST)
     rows = [[c for c in every if c.kind == kind] for kind in _KINDS]
     each = -(-count // len(rows))
-    spread = [[own[len(own) * k // each] for k in range(each)] for own in rows]
-    return [own[k] for k in range(each) for own in spread][:count]
+    spread = [[item[len(item) * k // each] for k in range(each)] for item in rows]
+    return [item[k] for k in range(each) for item in spread][:count]
 
 
 def said_of(source: Source, draw: int) -> Said:
@@ -163,30 +165,30 @@ def added(progress: Progress, quick: bool) -> Outcome:
     pieces = excerpts_from_reversals(1 if quick else EXCERPTS)[: 1 if quick else None]
     plain = on_all_cores(by_itself, [(p,) for p, _ in pieces], progress)
     jobs = [
-        (piece, others, effect, FIRST_ADDED + 100 * k + j, *own)
-        for k, ((piece, others), own) in enumerate(zip(pieces, plain, strict=True))
+        (piece, others, effect, FIRST_ADDED + 100 * k + j, *item)
+        for k, ((piece, others), item) in enumerate(zip(pieces, plain, strict=True))
         for j, effect in enumerate(effects)
     ]
-    found = on_all_cores(with_effect, jobs, progress, lambda f: f"{f.record} with {f.effect}")
+    result = on_all_cores(with_effect, jobs, progress, lambda f: f"{f.record} with {f.effect}")
     each = [
         {"record": f.record, "named by itself": ", ".join(f.own) or "-", "added": f.effect,
          **{how: f"{s.verdict}: {', '.join(s.within) or '-'}"
             for how, s in zip(_WAYS, f.said, strict=True)}}
-        for f in found
+        for f in result
     ]  # fmt: skip
-    kept = [f for k, f in enumerate(found) if k % TUNED] if not quick else found
+    kept = [f for k, f in enumerate(result) if k % TUNED] if not quick else result
     pairs = on_all_cores(unchanged, _pairs(quick), progress, lambda f: str(f["record"]))
-    alike = TitledTable(
+    titled_table = TitledTable(
         "Records of the same healthy device: nothing has changed", pairs,
         "A wrong name is any name. Measured records, and halves of the clean records of the exam.",
     )  # fmt: skip
-    return Outcome((summary(kept), alike, TitledTable("What was said of each", each)))
+    return Outcome((summary(kept), titled_table, TitledTable("What was said of each", each)))
 
 
 def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Record, ...]]]:
     """Return excerpts of the measured records, each from a reversal on, and what else there is."""
     rng = np.random.default_rng(FIRST_ADDED)
-    found = []
+    items = []
     for record in datasets.micromanipulator():
         turns = [t for t in reversals(record.voltage) if t + LENGTH <= record.n]
         for start in np.sort(rng.choice(turns, each, replace=False)).tolist():
@@ -194,8 +196,8 @@ def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Recor
             parts = ((0, start), (start + LENGTH, record.n))
             others = tuple(record.slice(a, b) for a, b in parts if b - a >= _FEWEST)
             name = f"{record.name} from {record.time[start]:.1f} s"
-            found.append((replace(piece, name=name), others))
-    return found
+            items.append((replace(piece, name=name), others))
+    return items
 
 
 def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
@@ -206,7 +208,7 @@ def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
 
 def with_effect(
     record: psa.Record, others: Sequence[psa.Record], effect: str, seed: int,
-    own: tuple[str, ...], left: float,
+    texts: tuple[str, ...], left: float,
 ) -> Added:  # fmt: skip
     """Diagnose a record with an effect on top of what it has by itself, without a reference and so.
 
@@ -217,22 +219,22 @@ def with_effect(
     new = replace(record, displacement=np.asarray(record.displacement) + more)
     every = (psa.diagnose([new], reference=sound) for sound in ((), others, [again]))
     without, other, same = (Named(d.verdict, *names_of(d)) for d in every)
-    return Added(record.name, effect, own, (without, other, same))
+    return Added(record.name, effect, texts, (without, other, same))
 
 
 def _pairs(quick: bool) -> list[tuple[str, psa.Record, psa.Record]]:
     """Return pairs of records of the same healthy device, of which the second is the reference."""
     sine, loops = datasets.micromanipulator()
     cuts = [sine.slice(k, k + 1500) for k in range(0, sine.n - 1500, 1500)]
-    found = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
-    found += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
+    items = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
+    items += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
     for record in RECORDS:
         if record.question.group == "clean":
             (whole,) = _records(record)[1]
             first, second = whole.slice(0, whole.n // 2), whole.slice(whole.n // 2, whole.n)
-            found.append((f"{record.name}, first half", first, second))
-            found.append((f"{record.name}, second half", second, first))
-    return found[::12] if quick else found
+            items.append((f"{record.name}, first half", first, second))
+            items.append((f"{record.name}, second half", second, first))
+    return items[::12] if quick else items
 
 
 def unchanged(name: str, new: psa.Record, reference: psa.Record) -> dict[str, object]:
@@ -272,9 +274,9 @@ def summary(found: Sequence[Added]) -> TitledTable:
     """Return how often the effect is named, and how often another one that is not there."""
     new = [f for f in found if called(f.effect) not in f.own]
 
-    def row(figure: str, asked: str, of: Callable[[Added, Named], bool]) -> dict[str, object]:
+    def row(figure: str, text: str, of: Callable[[Added, Named], bool]) -> dict[str, object]:
         ways = {how: share([of(f, f.said[k]) for f in new]) for k, how in enumerate(_WAYS)}
-        return {"figure": figure, "asked": asked, **ways}
+        return {"figure": figure, "asked": text, **ways}
 
     def right(f: Added, s: Named) -> tuple[str, ...]:
         return (called(f.effect), *(f.own if s is f.said[0] else ()))
@@ -320,13 +322,13 @@ def excerpts(progress: Progress, quick: bool) -> Outcome:
     the piece.
     """
     every = pieces(datasets.micromanipulator(), QUICK_PIECES if quick else PIECES)
-    told = lambda e: f"{e.piece}: {e.how}"  # noqa: E731
-    return Outcome([ends(on_all_cores(ended_of, [(piece,) for piece in every], progress, told))])
+    output = lambda e: f"{e.piece}: {e.how}"  # noqa: E731
+    return Outcome([ends(on_all_cores(ended_of, [(piece,) for piece in every], progress, output))])
 
 
 def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
     """Return so many pieces of records, in turn, each named for what was done to it."""
-    rng, found = np.random.default_rng(SEED), []
+    rng, result = np.random.default_rng(SEED), []
     for k in range(count):
         whole = records[k % len(records)]
         length = int(rng.integers(LENGTHS[0], min(LENGTHS[1], whole.n)))
@@ -336,12 +338,12 @@ def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
         turn, sign = (float(rng.choice([-1.0, 1.0], p=[_TURNED, 1 - _TURNED])) for _ in "xv")
         part = whole.slice(first, first + length)
         name = f"{whole.name} {first}:{first + length}:{keep}, x {scale * turn:g}, v {sign:+g}"
-        shown = scale * turn * np.asarray(part.displacement)[::keep]
+        displayed = scale * turn * np.asarray(part.displacement)[::keep]
         voltage = sign * part.voltage[::keep]
-        found.append(
-            psa.Record(name=name, time=part.time[::keep], voltage=voltage, displacement=shown)
+        result.append(
+            psa.Record(name=name, time=part.time[::keep], voltage=voltage, displacement=displayed)
         )
-    return found
+    return result
 
 
 def ended_of(piece: psa.Record) -> Ended:
@@ -351,12 +353,12 @@ def ended_of(piece: psa.Record) -> Ended:
         d = psa.diagnose([piece])
         finite = all(np.all(np.isfinite(y)) for y in (*d.base, *d.extended))
         how: str = d.verdict if finite and d.to_json() else "crashed"
-        said = ", ".join(c.effect for c in d.causes)
+        text = ", ".join(c.effect for c in d.causes)
     except psa.InputError as error:
-        how, said = "refused", str(error)
+        how, text = "refused", str(error)
     except Exception as error:  # noqa: BLE001 - what is counted here
-        how, said = "crashed", f"{type(error).__name__}: {error}"
-    return Ended(piece.name, how, said, process_time() - begin)
+        how, text = "crashed", f"{type(error).__name__}: {error}"
+    return Ended(piece.name, how, text, process_time() - begin)
 
 
 def ends(found: Sequence[Ended]) -> TitledTable:
@@ -364,9 +366,9 @@ def ends(found: Sequence[Ended]) -> TitledTable:
     counts = Counter(e.how for e in found)
     counts["crashed"] += 0
     failed = [e for e in found if e.how in ("refused", "crashed")]
-    said = Counter((f"{e.how} because", e.said.split(";")[0][:80]) for e in failed)
+    counter = Counter((f"{e.how} because", e.said.split(";")[0][:80]) for e in failed)
     lines = [(how, n, "") for how, n in sorted(counts.items())]
-    lines += [(how, n, text) for (how, text), n in sorted(said.items())]
+    lines += [(how, n, text) for (how, text), n in sorted(counter.items())]
     slowest = max(found, key=lambda e: e.seconds)
     return TitledTable(
         f"{len(found)} spoilt pieces of measured records",

@@ -125,13 +125,13 @@ def one_run(name: str, seed: int) -> Run:
     clean = clean_set(truth)
     level = NOISE * max(r.range_m for r in clean)
     records = with_noise(clean, NOISE, (tuple(psa.STACKS).index(name), seed))
-    found = psa.identify(records, stiffness=truth["k_B"])
+    result = psa.identify(records, stiffness=truth["k_B"])
     size = static_compliance(truth) * truth["h_ref"]
-    told = found.determinacy.names
-    drawn = drawn_scores(model, clean, records, told, level, size)
-    white = tuple(whiteness(r)[0] > _WHITE for r in found.fit.residuals_of(found.experiments))
-    quality = (found.fit.rms / level, white, found.fit.converged)
-    return Run(name, compared(found, truth, drawn), *quality)
+    output = result.determinacy.names
+    drawn = drawn_scores(model, clean, records, output, level, size)
+    white = tuple(whiteness(r)[0] > _WHITE for r in result.fit.residuals_of(result.experiments))
+    quality = (result.fit.rms / level, white, result.fit.converged)
+    return Run(name, compared(result, truth, drawn), *quality)
 
 
 def compared(found: psa.Identification, truth: Values, drawn: Values) -> tuple[Found, ...]:
@@ -144,8 +144,8 @@ def compared(found: psa.Identification, truth: Values, drawn: Values) -> tuple[F
     open_ones = {*known.undetermined, *known.on_bound}
     results = []
     for key, error in zip(value, errors.tolist(), strict=True):
-        told = key in known.names and key not in open_ones and error < _WEAK * abs(value[key])
-        results.append(Found(key, true[key], value[key], error, told, drawn[key]))
+        output = key in known.names and key not in open_ones and error < _WEAK * abs(value[key])
+        results.append(Found(key, true[key], value[key], error, output, drawn[key]))
     return tuple(results)
 
 
@@ -158,9 +158,9 @@ def quantities(p: Values, size: float) -> dict[str, float]:
     c = static_compliance(p)
     bend = c * (size / (c * p["h_ref"])) ** p["n"]
     factors = {"k_L": c, "A": c, "beta": bend, "gamma": bend, "delta": c, "n": 1.0, "tau": 1.0}
-    found = {name: factor * p[name] for name, factor in factors.items()}
-    found["R_s"] = p["R_s"] * p["C_p"]
-    return found | {f"{q}_{part}": p[f"{q}_{part}"] / p[f"k_{part}"] for part in "PB" for q in "cm"}
+    table = {name: factor * p[name] for name, factor in factors.items()}
+    table["R_s"] = p["R_s"] * p["C_p"]
+    return table | {f"{q}_{part}": p[f"{q}_{part}"] / p[f"k_{part}"] for part in "PB" for q in "cm"}
 
 
 def share_sentence(runs: Sequence[Run]) -> str:
@@ -168,13 +168,13 @@ def share_sentence(runs: Sequence[Run]) -> str:
 
     Quantities of one run depend on each other, so the error is that of a mean over runs.
     """
-    told = [f for r in runs for f in r.told]
-    held = sum(f.covered for f in told)
-    share, drawn = held / len(told), float(np.mean([f.covered_by_draws for f in told]))
+    items = [f for r in runs for f in r.told]
+    held = sum(f.covered for f in items)
+    share, drawn = held / len(items), float(np.mean([f.covered_by_draws for f in items]))
     over = [sum(f.covered for f in r.told) - share * len(r.told) for r in runs]
-    error = float(np.sqrt(np.sum(np.square(over)))) / len(told)
+    error = float(np.sqrt(np.sum(np.square(over)))) / len(items)
     return (
-        f"Of {len(told)} intervals {held} hold the truth, {100.0 * share:.1f} % (standard error"
+        f"Of {len(items)} intervals {held} hold the truth, {100.0 * share:.1f} % (standard error"
         f" {100.0 * error:.1f} %). By these draws alone it would be {100.0 * drawn:.1f} %."
     )
 

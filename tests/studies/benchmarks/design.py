@@ -75,8 +75,8 @@ class Resolved(NamedTuple):
 
     def __str__(self) -> str:
         """Return pair and answers in a line."""
-        said = ", ".join(f"{n} {v} ({self.growth[n]:.3g})" for n, v in self.named.items())
-        return f"{self.effect} or {self.rival} after a {self.voltage}; {said}"
+        text = ", ".join(f"{n} {v} ({self.growth[n]:.3g})" for n, v in self.named.items())
+        return f"{self.effect} or {self.rival} after a {self.voltage}; {text}"
 
 
 def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
@@ -84,15 +84,15 @@ def resolve_pairs(count: int, first: int, progress: Progress) -> list[Resolved]:
 
     They come in the order of their seeds, with those among them that no voltage tells.
     """
-    found: list[Resolved] = []
+    resolveds: list[Resolved] = []
     batch = 4 * (os.cpu_count() or 1)
-    while sum(bool(r.named) for r in found) < count:
+    while sum(bool(r.named) for r in resolveds) < count:
         seeds = [(seed,) for seed in range(first, first + batch)]
         for one in on_all_cores(resolve, seeds, progress):
-            if one is not None and sum(bool(r.named) for r in found) < count:
-                found.append(one)
+            if one is not None and sum(bool(r.named) for r in resolveds) < count:
+                resolveds.append(one)
         first += batch
-    return found
+    return resolveds
 
 
 def resolve(seed: int) -> Resolved | None:
@@ -150,10 +150,10 @@ def judged(d: psa.StackDiagnosis, effect: str) -> str:
 
 def _summary(found: Sequence[Resolved]) -> TitledTable:
     played = [r for r in found if r.named]
-    alike = [r for r in played if r.plays is None]
+    items = [r for r in played if r.plays is None]
     rows = []
     for name in _FURTHER:
-        asked = f"{round(0.9 * len(played))} of {len(played)} right" if name == "designed" else ""
+        text = f"{round(0.9 * len(played))} of {len(played)} right" if name == "designed" else ""
         counts = {
             f"{value} name" if value != "open" else value: sum(
                 r.named[name] == value for r in played
@@ -161,7 +161,7 @@ def _summary(found: Sequence[Resolved]) -> TitledTable:
             for value in ("right", "wrong", "open")
         }
         growth = f"{np.median([r.growth[name] for r in played]):.3g}"
-        rows.append({"further record": name, "asked": asked, **counts,
+        rows.append({"further record": name, "asked": text, **counts,
                      "predicted ln B, median": growth})  # fmt: skip
     return TitledTable(
         "Ambiguous pairs on independent plants, after one further record",
@@ -170,9 +170,9 @@ def _summary(found: Sequence[Resolved]) -> TitledTable:
         " bend the same curve, which no voltage of such a record tells apart: nothing was played."
         " All further records have the length, the sampling and the voltage range of the first. The"
         " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
-        f" of the two truths. Of {len(alike)} pairs it was said beforehand that no record found,"
+        f" of the two truths. Of {len(items)} pairs it was said beforehand that no record found,"
         f" nor {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %;"
-        f" {sum(r.named['designed'] == 'open' for r in alike)} of them stayed open with the"
+        f" {sum(r.named['designed'] == 'open' for r in items)} of them stayed open with the"
         " designed one.",
     )
 

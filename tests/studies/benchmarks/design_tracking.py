@@ -31,11 +31,11 @@ def creeping_displacement(
     values: Mapping[str, float], time: FloatArray, voltage: FloatArray, *, rtol: float = 1e-7
 ) -> FloatArray:
     """Return the displacement (n,) [m] of a voltage (n,) [V] that starts at 0 from rest."""
-    found = reference.simulate(
+    result = reference.simulate(
         values, reference.from_samples(time, voltage), time,
         breakpoints=[float(t) for t in time[1:-1]], rtol=rtol,
     )  # fmt: skip
-    return crept(values, time, found.displacement)
+    return crept(values, time, result.displacement)
 
 
 def crept(values: Mapping[str, float], time: FloatArray, x: FloatArray) -> FloatArray:
@@ -143,11 +143,11 @@ def own_bang_bang(model: psa.Model, found: QuickMove) -> float | None:
             p, voltage, time, initial=initial, breakpoints=ends[:-1].tolist(), rtol=1e-9
         )
         s = {n: float(v[-1]) for n, v in run.states.items()}
-        shown = float(crept(p, time, run.displacement)[-1])
+        displayed = float(crept(p, time, run.displacement)[-1])
         force, c = p["k_L"] * p["G"] * held + s["f_H"], 1.0 / p["k_P"] + 1.0 / p["k_B"]
         w_p, w_b = np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])
         far = [(s["f_out"] - force) * c, s["y"] - force / p["k_P"], s["x"] - force * c,
-               shown - found.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
+               displayed - found.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
         return 100.0 * np.array([(s["u"] - p["G"] * held) / span, *(d / move for d in far)])
 
     solved = least_squares(
@@ -166,9 +166,9 @@ def _arcs(voltage: FloatArray, limits: tuple[float, float]) -> FloatArray:
     high = voltage > 0.5 * sum(limits)
     switches = np.flatnonzero(np.diff(high.astype(int))) + 1
     edges = np.concatenate([[0], switches, [high.size]]) / high.size
-    seen = np.diff(edges)[: ARCS - len(_TAIL)]
-    rest = np.full(ARCS - len(_TAIL) - len(seen), _TAIL[0])
-    return np.concatenate([seen, rest, _TAIL])
+    observed = np.diff(edges)[: ARCS - len(_TAIL)]
+    rest = np.full(ARCS - len(_TAIL) - len(observed), _TAIL[0])
+    return np.concatenate([observed, rest, _TAIL])
 
 
 #: The stack carries a payload [kg], so that it rings at 1.6 kHz, and a loop 10 % of the stroke.
@@ -263,14 +263,14 @@ def after_trials(
 
     The plant is the reference with `values`; the model knows its own values only.
     """
-    shown = creeping_displacement(values, target.time, voltage)
-    gain = target.span / float(np.ptp(shown))
-    found = [error_of(target, shown), judged(values, target, gain * voltage)]
+    displayed = creeping_displacement(values, target.time, voltage)
+    gain = target.span / float(np.ptp(displayed))
+    items = [error_of(target, displayed), judged(values, target, gain * voltage)]
     for _ in range(2):
-        voltage = correct(model, target, voltage, shown)
-        shown = creeping_displacement(values, target.time, voltage)
-        found.append(error_of(target, shown))
-    return [e.rms_percent for e in found]
+        voltage = correct(model, target, voltage, displayed)
+        displayed = creeping_displacement(values, target.time, voltage)
+        items.append(error_of(target, displayed))
+    return [e.rms_percent for e in items]
 
 
 def _wrong(
@@ -278,15 +278,15 @@ def _wrong(
 ) -> TitledTable:
     generator, short = np.random.default_rng(_SEED), len(target.time) // 4
     part = Target(target.time[:short], target.displacement[:short])
-    found = []
+    items = []
     for draw in range(draws):
         progress(f"parameters off by 5 %: draw {draw + 1} of {draws}")
-        found.append(after_trials(model, wrong_values(model, generator), part, voltage[:short]))
+        items.append(after_trials(model, wrong_values(model, generator), part, voltage[:short]))
     names = ("as designed", "scaled by one measured range", "after one trial", "after two trials")
     rows = [
         {"voltage": n, "error, median [% rms]": number(float(np.median(e))),
          "worst [% rms]": number(max(e))}
-        for n, e in zip(names, zip(*found, strict=True), strict=True)
+        for n, e in zip(names, zip(*items, strict=True), strict=True)
     ]  # fmt: skip
     note = (
         f"{draws} draws of random signs, all parameters off by 5 %, the gain by up to 10 %: no"
@@ -301,16 +301,18 @@ def _moves(progress: Progress, quick: bool) -> TitledTable:
         model = scanner(payload)
         for begin, end in ((2e-6, 10e-6), (10e-6, 2e-6))[: 1 if quick else 2]:
             progress(f"quickest move, {payload:g} kg")
-            found = quickest_move(model, begin, end, LIMITS)
+            quick_move = quickest_move(model, begin, end, LIMITS)
             bound = bang_bang_bound(model.values, begin, end, -20.0, 120.0)
             row = {"payload [kg]": f"{payload:g}", "move [um]": f"{1e6 * begin:g} to {1e6 * end:g}",
-                   "time [us]": number(1e6 * found.move_time)}  # fmt: skip
-            own = own_bang_bang(model, found)
+                   "time [us]": number(1e6 * quick_move.move_time)}  # fmt: skip
+            value = own_bang_bang(model, quick_move)
             for least, name, over in ((bound, "bang-bang bound [us]", "over it [%]"),
-                                      (own, "own bang-bang [us]", "over that [%]")):  # fmt: skip
+                                      (value, "own bang-bang [us]", "over that [%]")):  # fmt: skip
                 row[name] = "none found" if least is None else number(1e6 * least)
-                row[over] = "" if least is None else number(100 * (found.move_time / least - 1))
-            rows.append(row | {"residual vibration [%]": number(100.0 * found.residual, 2)})
+                row[over] = (
+                    "" if least is None else number(100 * (quick_move.move_time / least - 1))
+                )
+            rows.append(row | {"residual vibration [%]": number(100.0 * quick_move.residual, 2)})
     note = (
         "-20 V to 120 V. The bound is that of the linear part, which knows neither hysteresis nor"
         " creep. The hysteresis takes part of the voltage of a move, and more of it downward, where"

@@ -30,15 +30,15 @@ RELIABILITY = (("known", "weak"), ("known", "weak", "left out"))
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Draw and diagnose all cases on all cores; the seeds are the same in every run."""
-    found = diagnosed(study(KNOWN, FOREIGN, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
-    tables = result_tables(found)
+    result = diagnosed(study(KNOWN, FOREIGN, QUICK_SEEDS if quick else SEEDS, FIRST), progress)
+    tables = result_tables(result)
     if not quick:
-        lost = missed(found)
+        lost = missed(result)
         known = diagnosed([f.case for f in lost], progress, only=True)
         jobs = [(effect, FIRST + 100 * k) for k, effect in enumerate(KNOWN, start=1)]
         gains = on_all_cores(covered, jobs, progress, lambda one: one.effect if one else "nothing")
         tables += [limits_table(lost, known), intervals_table([one for one in gains if one])]
-    return Outcome(tables, lambda: picture(found))
+    return Outcome(tables, lambda: picture(result))
 
 
 def result_tables(found: Sequence[Found]) -> list[TitledTable]:
@@ -187,10 +187,10 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
     for low, high in itertools.pairwise(BINS):
         row = {"stated probability": f"{100 * low:.0f} to {100 * high:.0f} %"}
         for kinds in RELIABILITY:
-            own, where = in_class(found, kinds, low, high), " (+ left out)" * (len(kinds) > 2)
-            means = [f"{100.0 * float(np.mean(x)):.0f} %" for x in zip(*own, strict=True)]
+            item, where = in_class(found, kinds, low, high), " (+ left out)" * (len(kinds) > 2)
+            means = [f"{100.0 * float(np.mean(x)):.0f} %" for x in zip(*item, strict=True)]
             row |= dict(zip(("mean" + where, "right" + where), means or ["", ""], strict=True))
-            row["effects" + where] = str(len(own))
+            row["effects" + where] = str(len(item))
         rows.append(row)
     return TitledTable(
         "Probability against frequency",
@@ -201,17 +201,17 @@ def _reliability(found: Sequence[Found]) -> TitledTable:
     )
 
 
-def limits_table(missed: Sequence[Found], known: Sequence[Found]) -> TitledTable:
+def limits_table(founds: Sequence[Found], known: Sequence[Found]) -> TitledTable:
     """Return each case that was missed beside what is said where its effect is known."""
     rows = []
-    for f, told in zip(missed, known, strict=True):
+    for f, output in zip(founds, known, strict=True):
         right = str(f.case.right)
         others = [e for name, e in f.evidence.items() if name != right]
         ahead = f"{max(others) - f.evidence[right]:+.1f}" if others and right in f.evidence else "-"
         rows.append({
             "hidden": right, "seed": f.case.seed, "rho": f"{f.rho:.2f}",
             "said": f"{f.verdict}: {', '.join(f.within)}" if f.within else f.verdict,
-            "known beforehand": f"{told.verdict}, {told.evidence.get(right, np.nan):.1f}",
+            "known beforehand": f"{output.verdict}, {output.evidence.get(right, np.nan):.1f}",
             "rival": ahead,
         })  # fmt: skip
     return TitledTable(
@@ -241,9 +241,9 @@ def _confusion(axes: Axes, found: Sequence[Found]) -> None:
     columns = (*dict.fromkeys(called(name) for name in KNOWN), *none)
     shares = np.zeros((len(rows), len(columns)))
     for f in found:
-        said = f.named[0] if f.named else str(f.verdict)
-        if said in columns:
-            shares[rows.index(f.case.effect or "nothing"), columns.index(said)] += 1.0
+        statement = f.named[0] if f.named else str(f.verdict)
+        if statement in columns:
+            shares[rows.index(f.case.effect or "nothing"), columns.index(statement)] += 1.0
     count = shares.sum(axis=1, keepdims=True)
     shares = 100.0 * shares / np.where(count > 0, count, 1.0)
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=100.0)
@@ -284,14 +284,14 @@ def draw_classes(
 ) -> None:
     """Draw for each class of stated probabilities how many are right [%], with 95 % intervals."""
     colour, fmt = f"C{(side + 1) // 2}", "os"[(side + 1) // 2]
-    for own in filter(None, classes):
-        stated, right = 100.0 * np.mean(own, axis=0)
-        ends = binomtest(sum(t for _, t in own), len(own)).proportion_ci(method="wilson")
+    for item in filter(None, classes):
+        stated, right = 100.0 * np.mean(item, axis=0)
+        ends = binomtest(sum(t for _, t in item), len(item)).proportion_ci(method="wilson")
         reach = [[right - 100.0 * ends.low], [100.0 * ends.high - right]]
         place = (float(stated) + 0.4 * side, float(right))
         axes.errorbar(*place, reach, fmt=fmt, color=colour, capsize=3.0)
         axes.annotate(
-            f"{sum(t for _, t in own)} of {len(own)}", place, fontsize=8, color=colour,
+            f"{sum(t for _, t in item)} of {len(item)}", place, fontsize=8, color=colour,
             xytext=(8.0 * side, -4.0), textcoords="offset points",
             ha="left" if side > 0 else "right",
         )  # fmt: skip
@@ -328,9 +328,9 @@ def intervals_table(found: Sequence[Covered]) -> TitledTable:
     }
     rows = [
         {"interval from": name,
-         "hold the truth": share(low <= true <= high for (low, high), true in own),
-         "median width": f"{np.median([b - a for (a, b), _ in own] or [np.nan]):.1f} %"}
-        for name, own in pairs.items()
+         "hold the truth": share(low <= true <= high for (low, high), true in item),
+         "median width": f"{np.median([b - a for (a, b), _ in item] or [np.nan]):.1f} %"}
+        for name, item in pairs.items()
     ]  # fmt: skip
     return TitledTable(
         "Intervals of the gain (95 %)",
@@ -343,17 +343,17 @@ def intervals_table(found: Sequence[Covered]) -> TitledTable:
 def covered(effect: str, seed: int) -> Covered | None:
     """Diagnose one record of an effect; None where nothing is named, so that nothing is gained."""
     truth, record = hidden_record(effect, seed, visible=ORDINARY)
-    found = psa.diagnose([record])
-    if not found.causes:
+    result = psa.diagnose([record])
+    if not result.causes:
         return None
-    models = (found.base_fit.model, found.extended_fit.model)
+    models = (result.base_fit.model, result.extended_fit.model)
     plays = [_play(played_again(truth, seed + k), models) for k in range(1, PLAYS + 1)]
     groups = [range(k, k + HELD_OUT) for k in range(0, PLAYS, HELD_OUT)]
     rests = [[p for k, p in enumerate(plays) if k not in group] for group in groups]
     return Covered(
         effect,
         _gain(plays).holdout_rms_reduction_percent,
-        found.gain.interval,
+        result.gain.interval,
         tuple(_gain([plays[k] for k in group]).interval for group in groups),
         tuple(_gain(rest).holdout_rms_reduction_percent for rest in rests),
     )

@@ -75,8 +75,8 @@ class Task:
 
     def start(self, model: psa.Model) -> tuple[FloatArray, FloatArray]:
         """Return the initial state (nx,) and its derivatives by the unknowns (nx, k)."""
-        found = start_on(model, self.time, self.inputs)
-        return found.x, found.by_parameter[:, [model.parameter_names.index(n) for n in FREE]]
+        start = start_on(model, self.time, self.inputs)
+        return start.x, start.by_parameter[:, [model.parameter_names.index(n) for n in FREE]]
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -130,12 +130,12 @@ def measured(task: Task, repeats: int, progress: Progress) -> list[Point]:
     x0, s0 = task.start(task.model)
     truth = _run(task, STEPPER, _TRUTH, x0, None)[0]
     ways = [(way, rtol) for way, rtols in TOLERANCES.items() for rtol in rtols]
-    works = [partial(_run, task, *way, x0, given) for way in ways for given in (s0, None)]
-    shown = [work() for work in works]  # compiles and loads what the first use needs
+    works = [partial(_run, task, *way, x0, inputs) for way in ways for inputs in (s0, None)]
+    items = [work() for work in works]  # compiles and loads what the first use needs
     times = [1e6 * s / task.record.n for _, s in table.least_times(works, repeats)]
     points = []
     for k, (way, rtol) in enumerate(ways):
-        x, taken = shown[2 * k + 1]
+        x, taken = items[2 * k + 1]
         with_, without = times[2 * k : 2 * k + 2]
         points.append(Point(way, rtol, _error(x, truth), with_, without, taken / task.record.n))
     return points
@@ -150,8 +150,8 @@ def _run(
     if way == EXACT:
         exact = run_exact(model, t, u, x0, tolerance=tolerance, **how)
         return exact.shown[:, 0], exact.steps
-    found = psa.run(model, t, u, x0, rtol=tolerance, **how)
-    return found.y[:, model.output_names.index(_OUTPUT)], found.steps
+    result = psa.run(model, t, u, x0, rtol=tolerance, **how)
+    return result.y[:, model.output_names.index(_OUTPUT)], result.steps
 
 
 def _error(x: FloatArray, truth: FloatArray) -> float:
@@ -168,11 +168,11 @@ def cheapest(points: Sequence[Point], way: str, of: str, error: float = WANTED) 
 
 def run_table(points: Sequence[Point], samples: int) -> TitledTable:
     """Return both ways at all tolerances, and the share of the stepper's time at equal error."""
-    said = []
+    items = []
     for of, words in (("differentiated", f"with {len(FREE)} sensitivities"), ("plain", "without")):
         ours, theirs = (cheapest(points, way, of) for way in (EXACT, STEPPER))
         ratio = number(getattr(theirs, of) / getattr(ours, of), 2)
-        said.append(f"{words} 1/{ratio} of the stepper's time (tolerances {ours.tolerance:.0e} and"
+        items.append(f"{words} 1/{ratio} of the stepper's time (tolerances {ours.tolerance:.0e} and"
                     f" {theirs.tolerance:.0e})")  # fmt: skip
     rows = [
         {"way": p.way, "tolerance of a step": f"{p.tolerance:.0e}",
@@ -184,7 +184,7 @@ def run_table(points: Sequence[Point], samples: int) -> TitledTable:
     return TitledTable(
         f"One run of the demonstration's record ({samples} samples)",
         rows,
-        f"At errors below {WANTED:.0e} of the range the exact way takes {'; '.join(said)}: of each"
+        f"At errors below {WANTED:.0e} of the range the exact way takes {'; '.join(items)}: of each"
         f" way the cheapest tolerance counts. Errors are against the stepper at {_TRUTH:.0e}; times"
         " are the least of the repeats and carry over to other machines as ratios only.",
     )
@@ -204,11 +204,11 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         np.array([getattr(m, of)() for m in models]).T
         for of in ("parameter_vector", "state_nominals")
     )
-    given, how = (task.time, task.inputs), dict[str, Any](tolerance=tolerance)
+    inputs, how = (task.time, task.inputs), dict[str, Any](tolerance=tolerance)
     together = partial(
         run_sets,
         task.model.structure,
-        *given,
+        *inputs,
         p=p,
         x0=np.array(starts).T,
         nominal=nominal,
@@ -216,7 +216,7 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
         **how,
     )
     single = partial(run_exact, outputs=(_OUTPUT,), **how)
-    singles = [partial(single, m, *given, x) for m, x in zip(models, starts, strict=True)]
+    singles = [partial(single, m, *inputs, x) for m, x in zip(models, starts, strict=True)]
     many = psa.simulate_many(task.model, sets, task.record, rtol=tolerance)
     for others in (np.array([one().shown[:, 0] for one in singles]), many):
         if not np.array_equal(together().T, others):
@@ -284,7 +284,7 @@ def diagnosis_table(demo: psa.Record, progress: Progress, quick: bool) -> Titled
 def _spent(work: str, samples: str, do: Callable[[], str]) -> dict[str, str]:
     wall, processor = time.perf_counter(), time.process_time()
     with psa.timed() as timings:
-        found = do()
+        result = do()
     wall, processor = time.perf_counter() - wall, time.process_time() - processor
     runs, with_derivatives = (
         str(sum(getattr(s, of) for s in timings.stages)) for of in ("runs", "differentiated")
@@ -292,13 +292,13 @@ def _spent(work: str, samples: str, do: Callable[[], str]) -> dict[str, str]:
     return {
         "work": work, "samples": samples, "wall [s]": number(wall),
         "processor [s]": number(processor), "over the stepper's": "", "simulations": runs,
-        "with derivatives": with_derivatives, "found": found,
+        "with derivatives": with_derivatives, "found": result,
     }  # fmt: skip
 
 
 def _diagnosed(records: Sequence[psa.Record]) -> str:
-    found = psa.diagnose(records)
-    return ", ".join(plain(c.effect) for c in found.causes) or str(found.verdict)
+    result = psa.diagnose(records)
+    return ", ".join(plain(c.effect) for c in result.causes) or str(result.verdict)
 
 
 def _identified(record: psa.Record) -> str:

@@ -51,11 +51,11 @@ def play(v: FloatArray, threshold: float, before: Sequence[float]) -> FloatArray
     state = 0.0
     for x in before:
         state = min(max(state, x - threshold), x + threshold)
-    shown = np.empty_like(v)
+    values = np.empty_like(v)
     for k, x in enumerate(v.tolist()):
         state = min(max(state, x - threshold), x + threshold)
-        shown[k] = state
-    return shown
+        values[k] = state
+    return values
 
 
 def memory(v: FloatArray, before: Sequence[float]) -> Columns:
@@ -65,10 +65,10 @@ def memory(v: FloatArray, before: Sequence[float]) -> Columns:
     """
     thresholds = np.arange(1, PLAYS + 1) / (PLAYS + 1.0)
     plays = np.column_stack([play(v, float(r), before) for r in thresholds])
-    shown = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
+    items = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
     curve = {"voltage": np.column_stack([v, v**2, v**3])}
     powers = {f"plays^{p}": plays**p for p in (1, 2, 3)}
-    return {**curve, **powers, "taps": np.column_stack(shown)}
+    return {**curve, **powers, "taps": np.column_stack(items)}
 
 
 def relaxations(v: FloatArray, driving: FloatArray, longest: float) -> Columns:
@@ -105,8 +105,8 @@ def _lagging(v: FloatArray, time: float) -> FloatArray:
     """Return a voltage behind a first-order lag of so many samples, settled at its start."""
     a = float(np.exp(-1.0 / time))
     lag, _ = lfilter([1.0 - a], [1.0, -a], v, zi=[a * v[0]])
-    shown: FloatArray = lag
-    return shown
+    values: FloatArray = lag
+    return values
 
 
 #: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
@@ -130,9 +130,9 @@ class Beside:
 
     def gain(self, columns: FloatArray) -> float:
         """Return by how much more columns lessen the sum of squares that is left."""
-        own = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
-        gram = own.T @ own + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
-        cross = own.T @ self.left
+        item = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
+        gram = item.T @ item + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
+        cross = item.T @ self.left
         return float(cross @ np.linalg.solve(gram, cross))
 
 
@@ -157,8 +157,8 @@ class Search:
     def next(self, others: Beside) -> Mode:
         """Return the mode or the line that explains most of what is left, refined."""
         mode = max(self._grid, key=lambda pair: others.gain(pair[1]))[0]
-        found = [self.tuned(m, others) for m in (mode, *self._line(others))]
-        return max(found, key=lambda m: others.gain(self._answer(m)))
+        items = [self.tuned(m, others) for m in (mode, *self._line(others))]
+        return max(items, key=lambda m: others.gain(self._answer(m)))
 
     def tuned(self, mode: Mode, others: Beside) -> Mode:
         """Return a mode with the frequency, and the damping unless it is 0, that explain most."""
@@ -177,8 +177,8 @@ class Search:
         begin = np.array([mode.frequency] if line else [mode.frequency, np.log(mode.damping)])
         moves = np.vstack([np.zeros(len(begin)), np.diag([step, 0.7][: len(begin)])])
         options: Any = {"maxfev": _STEPS, "initial_simplex": begin + moves}
-        found: Any = minimize(loss, begin, method="Nelder-Mead", options=options)
-        return made(found.x)
+        result: Any = minimize(loss, begin, method="Nelder-Mead", options=options)
+        return made(result.x)
 
     def _line(self, others: Beside) -> list[Mode]:
         """Return the largest line that stands out of the spectrum of what is left, if one does."""
@@ -306,13 +306,13 @@ class _Problem:
         """Return the columns of every part, an offset first."""
         every = []
         for k, (v, history) in enumerate(zip(self.voltages, histories, strict=True)):
-            own = {"offset of its start": np.ones((len(v), 1)), **self.slow(k, history)}
+            table = {"offset of its start": np.ones((len(v), 1)), **self.slow(k, history)}
             parts = [("modes", modal(v, m)) for m in modes if m.damping]
             parts += [(f"start of {'modes' if m.damping else 'lines'}", ringing(len(v), m))
                       for m in modes]  # fmt: skip
             for kind in dict.fromkeys(kind for kind, _ in parts):
-                own[kind] = np.hstack([x for name, x in parts if name == kind])
-            every.append(own)
+                table[kind] = np.hstack([x for name, x in parts if name == kind])
+            every.append(table)
         return every
 
     def _slow(self, k: int, history: History) -> Columns:
@@ -323,8 +323,8 @@ class _Problem:
     def fitted(self, columns: Sequence[Columns], curves: Sequence[Columns] = ()) -> _Fitted:
         """Fit the used samples with the columns, and with curves over the displacement."""
         features, kinds = stacked(columns, curves)
-        found = ridge(features[self.used], kinds, self.y[self.used])
-        return _Fitted(found, features, features @ found.weights, curves)
+        result = ridge(features[self.used], kinds, self.y[self.used])
+        return _Fitted(result, features, features @ result.weights, curves)
 
     def with_curve(self, columns: Sequence[Columns], knots: int) -> _Fitted:
         """Fit with a curve over what the other columns say that the displacement is."""

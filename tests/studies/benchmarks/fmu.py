@@ -163,14 +163,14 @@ def _scipy(solver: Any, case: Case, fmu: Fmu, tolerance: float) -> Solved:
                 return instance.derivatives(time, x, {"voltage": case.at(min(time, last))})
 
             how: Any = {"rtol": tolerance, "atol": atol}
-            found = solve_ivp(rates, (t[begin], t[end]), x, solver, t[begin + 1 : end + 1], **how)
-            if not found.success:
-                raise FmuError(f"scipy stopped after {t[begin]:g} s: {found.message}")
+            result = solve_ivp(rates, (t[begin], t[end]), x, solver, t[begin + 1 : end + 1], **how)
+            if not result.success:
+                raise FmuError(f"scipy stopped after {t[begin]:g} s: {result.message}")
             counted = calls[0]
-            for time, state in zip(found.t, found.y.T, strict=True):
+            for time, state in zip(result.t, result.y.T, strict=True):
                 rates(float(time), state)
                 rows.append(instance.get([_OUTPUT]))
-            calls[0], x = counted, found.y[:, -1]
+            calls[0], x = counted, result.y[:, -1]
     return np.array(rows)[:, 0], calls[0]
 
 
@@ -241,14 +241,14 @@ def _measured(
     name: str, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray, repeats: int
 ) -> Run:
     """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
-    found: list[Solved] = []
+    solveds: list[Solved] = []
     work = partial(METHODS[name], case, fmu, tolerance)
     try:
-        ((_, seconds),) = least_times([lambda: found.append(work())], repeats, _SLOW)
+        ((_, seconds),) = least_times([lambda: solveds.append(work())], repeats, _SLOW)
     except FmuError:
         return Run(name, tolerance, inf, inf, inf)
-    shown, evaluations = found[-1]
-    error = float(np.max(np.abs(shown - truth)) / np.ptp(truth))
+    displayed, evaluations = solveds[-1]
+    error = float(np.max(np.abs(displayed - truth)) / np.ptp(truth))
     evaluations = _stepped_count(case, tolerance) if evaluations is None else evaluations
     return Run(name, tolerance, error, seconds, evaluations or inf)
 
@@ -320,9 +320,9 @@ def measured(model: psa.Model, repetitions: int, *, fixed: bool) -> FloatArray:
         command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{Path(fmpy.__file__).parent}/c-code"]
         files = [str(_SOURCE), "stack.c", *compiled_files(texts), "-lm", "-o", "step_cost"]
         run_compiler([*command, *files], folder)
-        given = [token, str(repetitions), str(table["voltage"]), str(table["displacement"])]
+        items = [token, str(repetitions), str(table["voltage"]), str(table["displacement"])]
         done = subprocess.run(
-            [str(folder / "step_cost"), *given], input="\n".join(map(repr, voltage)),
+            [str(folder / "step_cost"), *items], input="\n".join(map(repr, voltage)),
             capture_output=True, text=True, check=True,
         )  # fmt: skip
     return np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()]).T

@@ -39,10 +39,10 @@ def tables(tally: Tally) -> list[TitledTable]:
     """Return what was counted by target, and the distinct failures, if there are any."""
     rows = []
     for name in (*(n for n in TARGETS if tally.inputs[n]), "all"):
-        own = [n for n in TARGETS if name in (n, "all")]
-        inputs, accepted = (sum(c[n] for n in own) for c in (tally.inputs, tally.accepted))
-        seconds = sum(tally.seconds.get(n, 0.0) for n in own)
-        failures = {kind: f"{sum(tally.kinds[n, kind] for n in own):,}" for kind in KINDS}
+        item = [n for n in TARGETS if name in (n, "all")]
+        inputs, accepted = (sum(c[n] for n in item) for c in (tally.inputs, tally.accepted))
+        seconds = sum(tally.seconds.get(n, 0.0) for n in item)
+        failures = {kind: f"{sum(tally.kinds[n, kind] for n in item):,}" for kind in KINDS}
         rows.append({
             "target": name, "inputs": f"{inputs:,}", "accepted": f"{accepted:,}", **failures,
             "inputs per s of a core": f"{inputs / max(seconds, 1e-9):,.3g}",
@@ -52,7 +52,7 @@ def tables(tally: Tally) -> list[TitledTable]:
         rows,
         "accepted: read or done without an error; all others were refused with a sentence.",
     )
-    found = [
+    items = [
         {"target": d.first.target, "kind": d.first.kind, "times": f"{d.times:,}",
          "the first of them": " ".join(d.first.sentence.split())[:150], "input": d.first.index,
          "file": d.file or "-"}
@@ -60,11 +60,11 @@ def tables(tally: Tally) -> list[TitledTable]:
     ]  # fmt: skip
     failed = TitledTable(
         "Distinct failures",
-        found,
+        items,
         "Again, from the file: python -m tests.studies fuzz --replay FILE;"
         f" from the seed: fuzz --only TARGET --seed {tally.seed} --from INPUT --inputs 1.",
     )
-    return [counted, failed] if found else [counted]
+    return [counted, failed] if items else [counted]
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

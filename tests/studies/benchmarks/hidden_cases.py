@@ -175,8 +175,8 @@ def diagnosed(
 def names_of(d: psa.StackDiagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the named causes, and these with what they cannot be told from."""
     named = tuple(c.effect for c in d.causes)
-    alike = (n for c in d.causes for n in c.cannot_be_told_from)
-    return named, tuple(dict.fromkeys((*named, *alike)))
+    similar = (n for c in d.causes for n in c.cannot_be_told_from)
+    return named, tuple(dict.fromkeys((*named, *similar)))
 
 
 def _patched(d: psa.StackDiagnosis) -> float:

@@ -141,14 +141,14 @@ CASES = (
 
 def run(progress: Progress, quick: bool, folder: Path | None = None, only: str = "") -> Outcome:
     """Identify every FMU, and diagnose it with a lag, with a gain and with nothing hidden."""
-    found, hidden = list[Row](), list[Row]()
+    result, hidden = list[Row](), list[Row]()
     for case in (c for c in CASES if only in c.name):
         path = case.path(folder or Path())
         if not path.is_file():
-            found.append({"fmu": case.name, "kind": f"no {path}"} | dict.fromkeys(_HEADS, "-"))
+            result.append({"fmu": case.name, "kind": f"no {path}"} | dict.fromkeys(_HEADS, "-"))
             continue
         progress(case.name)
-        found.append(_identified(case, path))
+        result.append(_identified(case, path))
         if not quick:
             hidden.append(_diagnosed(case, path, progress))
     note = (
@@ -156,7 +156,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         " by the FMU, where it is run as a whole. Cost: half the sum of squares over the noise,"
         " ours over the peer's."
     )
-    tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", found, note)]
+    tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", result, note)]
     if hidden:
         tables.append(TitledTable("What hides around them", hidden))
     if not only:
@@ -169,16 +169,16 @@ def _held() -> list[Row]:
     held = psa.export_extended(with_effects(), Path(_FOLDER.name) / "held.fmu")
     rows, points = list[Row](), np.linspace(0.0, 100.0, 2001)
     flow = np.interp(points, TIMES, INFLOW)
-    given = np.array([*zip(points, flow, strict=True)], [("time", float), ("inflow", float)])
+    inputs = np.array([*zip(points, flow, strict=True)], [("time", float), ("inflow", float)])
     truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
     for name, path, starts in (("original", supplied("tank"), {"valve": True}), ("held", held, {})):
         begin = perf_counter()
-        shown = fmpy.simulate_fmu(
-            str(path), stop_time=100.0, output_interval=0.05, input=given, output=["level"],
+        displayed = fmpy.simulate_fmu(
+            str(path), stop_time=100.0, output_interval=0.05, input=inputs, output=["level"],
             start_values=starts, validate=False,
         )  # fmt: skip
         took = perf_counter() - begin
-        off = np.max(np.abs(np.interp(TIMES, shown["time"], shown["level"]) - truth))
+        off = np.max(np.abs(np.interp(TIMES, displayed["time"], displayed["level"]) - truth))
         error = f"{off / np.ptp(truth):.2g}" if name == "held" else "-"
         rows.append({"fmu": name, "s": f"{took:.2f}", "error over the range": error})
     return rows
@@ -197,8 +197,8 @@ def _input(case: Case) -> tuple[FloatArray, FloatArray]:
 def record_of(case: Case, *, lag: float = 0.0, gain: float = 1.0) -> dict[str, FloatArray]:
     """Return the record of a plant; a lag in its first output, a gain of its input, else of it."""
     t, u = _input(case)
-    shown = case.shown(t, u * gain if case.input else u, case.true)
-    y = dict(shown)
+    displayed = case.shown(t, u * gain if case.input else u, case.true)
+    y = dict(displayed)
     first = next(iter(y))
     if not case.input:
         y[first] = gain * y[first]
@@ -210,8 +210,8 @@ def record_of(case: Case, *, lag: float = 0.0, gain: float = 1.0) -> dict[str, F
         ).y[0]  # fmt: skip
     rng = np.random.default_rng(_SEED)
     noisy = {n: v + _NOISE * np.std(v) * rng.standard_normal(len(t)) for n, v in y.items()}
-    own = {_plain(case.input): u} if case.input else {}
-    return {"time": t, **own, **noisy}
+    item = {_plain(case.input): u} if case.input else {}
+    return {"time": t, **item, **noisy}
 
 
 def _plain(name: str) -> str:
@@ -226,14 +226,14 @@ def _identified(case: Case, path: Path) -> Row:
     model, record = _model(case, path, case.free), record_of(case)
     RUNS.forget()
     samples, begin = RUNS.samples, perf_counter()
-    found = psa.identify(model, record, known_start=True)
+    result = psa.identify(model, record, known_start=True)
     took, runs = perf_counter() - begin, (RUNS.samples - samples) / _SAMPLES
     names = [_plain(n) for n in case.true]
     off = max(
-        abs(found.model.values[n] - v) / found.errors[n]
+        abs(result.model.values[n] - v) / result.errors[n]
         for n, v in zip(names, case.true.values(), strict=True)
     )
-    ours = 0.5 * float(np.sum(_residuals(found.model, case, record) ** 2))
+    ours = 0.5 * float(np.sum(_residuals(result.model, case, record) ** 2))
     peer, calls = _peer(model, case, record)
     return {
         "fmu": case.name, "kind": case.kind, "off": f"{off:.1f}",
@@ -266,11 +266,11 @@ def _peer(
 
     starts = np.array([model.values[n] for n in names])
     low, high = np.array([case.free[n] for n in case.true]).T
-    found = least_squares(
+    result = least_squares(
         residuals, starts, bounds=(low, high), x_scale=np.abs(starts),
         diff_step=[1e-3] * len(starts),
     )  # fmt: skip
-    return float(found.cost), calls
+    return float(result.cost), calls
 
 
 def _diagnosed(case: Case, path: Path, progress: Progress) -> Row:

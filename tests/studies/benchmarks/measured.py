@@ -36,13 +36,13 @@ def run(progress: Progress, quick: bool) -> Outcome:
         progress(f"{record.name}: {name} model")
         fits = {name: search(starting_model([record]), experiments, thorough=True).best}
         for effect, start in ADDED.items():
-            found = fits[name]
+            result = fits[name]
             name = f"{name}, {effect}" if len(fits) > 1 else f"with {effect}"
             progress(f"{record.name}: {name}")
-            model, states = found.model.with_effect(psa.EFFECTS[effect], start), found.starts()
+            model, states = result.model.with_effect(psa.EFFECTS[effect], start), result.starts()
             more = (p.name for p in psa.EFFECTS[effect].parameters)
-            free = [*found.unknowns.names, *more]
-            how: Any = {"sigma": found.sigma, "start_states": states}
+            free = [*result.unknowns.names, *more]
+            how: Any = {"sigma": result.sigma, "start_states": states}
             fits[name] = refit(fit(model, experiments, free, **how), experiments, free)
         for name, fitted in fits.items():
             e, share = _errors(fitted, experiments), 100.0 / record.range_m
@@ -67,12 +67,12 @@ def _diagnoses(progress: Progress) -> tuple[list[TitledTable], psa.StackDiagnosi
     and with its sign turned: where both are as good, the sine does not see the cause.
     """
     sine, loops = datasets.micromanipulator()
-    given = {
+    table = {
         "sine_1hz": ([sine], []), "minor_loops": ([loops], []), "both files": ([sine, loops], []),
         "minor_loops, judged on sine_1hz": ([loops], [sine]),
     }  # fmt: skip
     rows, diagnoses = [], {}
-    for name, (records, held_out) in given.items():
+    for name, (records, held_out) in table.items():
         progress(f"{name}: the diagnosis")
         diagnoses[name] = d = psa.diagnose(records, holdout=held_out)
         rows.append({
@@ -81,31 +81,31 @@ def _diagnoses(progress: Progress) -> tuple[list[TitledTable], psa.StackDiagnosi
             "verdict": d.verdict, "causes": ", ".join(c.effect for c in d.causes),
         })  # fmt: skip
     progress("the sine with causes of the others")
-    found = diagnoses["sine_1hz"]
-    own = found.extended_fit
-    fits, there = [("as diagnosed", "", own)], {c.name for c in own.model.components}
+    result = diagnoses["sine_1hz"]
+    item = result.extended_fit
+    fits, there = [("as diagnosed", "", item)], {c.name for c in item.model.components}
     for name in ("minor_loops", "both files"):
         values = diagnoses[name].extended_fit.model.values
         causes = (psa.EFFECTS[c.effect] for c in diagnoses[name].causes if c.effect not in there)
         for cause in causes:
-            for sign, told in ((1.0, cause.name), (-1.0, f"{cause.name}, sign turned")):
+            for sign, output in ((1.0, cause.name), (-1.0, f"{cause.name}, sign turned")):
                 fixed = {p.name: values[p.name] for p in cause.parameters}
                 fixed |= {p: sign * values[p] for p in fixed if p == cause.gain}
-                start = replace(own, model=own.model.with_effect(cause, fixed))
-                again = refit(start, found.experiments, own.unknowns.names)
-                fits.append((told, name, again))
+                start = replace(item, model=item.model.with_effect(cause, fixed))
+                again = refit(start, result.experiments, item.unknowns.names)
+                fits.append((output, name, again))
     told_by_sine = []
-    for told, name, fitted in fits:
-        e = _errors(fitted, found.experiments)
+    for output, name, fitted in fits:
+        e = _errors(fitted, result.experiments)
         told_by_sine.append({
-            "the sine, fitted with": told, "as found in": name,
+            "the sine, fitted with": output, "as found in": name,
             "fitted, rms": f"{1e9 * e.train_rms_m:.2f} nm",
             "held out, rms": f"{1e9 * e.holdout_rms_m:.2f} nm",
         })  # fmt: skip
     return [
         TitledTable("What diagnose finds, percent of range", rows),
         TitledTable("What the sine says of causes of the other records", told_by_sine),
-    ], found
+    ], result
 
 
 def _errors(found: Fit, experiments: Sequence[Experiment]) -> Errors:

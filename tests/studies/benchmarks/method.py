@@ -37,15 +37,15 @@ def run(progress: Progress, quick: bool) -> Outcome:
     there = {c.name for c in base.model.components}
     table = [e for e in psa.EFFECTS.values() if not e.inputs or record.temperature is not None]
     table = [e for e in table if set(e.needs) <= there]
-    found = best_first(base, Task(experiments, tuple(table), STACK, progress=progress))
+    known = best_first(base, Task(experiments, tuple(table), STACK, progress=progress))
     d = psa.diagnose([record], progress=progress)
     rows = [
-        {"hypothesis": _named(h), "score": f"{found.scale.score(h):.0f}",
-         "may be the answer": "yes" if h.names in found.worthy else "no"}
-        for h in _best(found)
+        {"hypothesis": _named(h), "score": f"{known.scale.score(h):.0f}",
+         "may be the answer": "yes" if h.names in known.worthy else "no"}
+        for h in _best(known)
     ]  # fmt: skip
     title = f"The search on a record with {' and '.join(map(plain, HIDDEN))}"
-    return Outcome((TitledTable(title, rows),), partial(picture, found, d))
+    return Outcome((TitledTable(title, rows),), partial(picture, known, d))
 
 
 def picture(found: Known, d: psa.StackDiagnosis) -> Figure:

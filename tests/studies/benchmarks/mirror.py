@@ -96,9 +96,9 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
     voltage drive at all w_n, and samples do not tell these apart.
     """
     first = next(iter(responses.values()))
-    told = np.flatnonzero(np.abs(first[:, 0, 0]) > 0)[1::EVERY]
-    w, count = 2 * np.pi * np.linspace(0.0, RATE / 2, len(first))[told], len(PEAKS)
-    target = np.vstack([1e6 * g[told].reshape(len(told), -1) for g in responses.values()])
+    output = np.flatnonzero(np.abs(first[:, 0, 0]) > 0)[1::EVERY]
+    w, count = 2 * np.pi * np.linspace(0.0, RATE / 2, len(first))[output], len(PEAKS)
+    target = np.vstack([1e6 * g[output].reshape(len(output), -1) for g in responses.values()])
 
     def columns(q: FloatArray, images: int) -> list[ComplexArray]:
         """Return the responses of all modes times (j w / w_r)^0, 1, 2, and what follows at once."""
@@ -112,9 +112,9 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
             gain, stays = 1 + q[-1] * above, np.exp(-1e4 / (RATE * q[-2]))
             drive = gain * held / (1 + 1e-4j * every * q[-2])
             poles = drive / (1 + x**2 + 2 * damping * (1 + lossier * above) * x)
-            own = [np.sum(poles * x**k, axis=1).T for k in range(3)]
+            items = [np.sum(poles * x**k, axis=1).T for k in range(3)]
             later = np.exp(-1j * w / RATE)[:, None]
-            parts.append([*own, gain * (1 - stays) * later / (1 - stays * later)])
+            parts.append([*items, gain * (1 - stays) * later / (1 - stays * later)])
         return [np.vstack(part) for part in zip(*parts, strict=True)]
 
     def errors(q: FloatArray) -> FloatArray:
@@ -145,22 +145,22 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
     for j, b in enumerate(driven.T):
         first, second = plain * b.real + quick * b.imag, quick * b.real + quicker * b.imag
         rows.append(np.hstack([first, second, rest * np.eye(len(AXES))[j]]))
-    seen = target.reshape(-1, len(AXES), len(AXES)).transpose(2, 0, 1).reshape(-1, len(AXES))
-    factors = solved(np.vstack(rows), seen)[0]
-    shown = factors[:count] + 1j * factors[count : 2 * count]
+    observed = target.reshape(-1, len(AXES), len(AXES)).transpose(2, 0, 1).reshape(-1, len(AXES))
+    factors = solved(np.vstack(rows), observed)[0]
+    displayed = factors[:count] + 1j * factors[count : 2 * count]
     modes = []
     for k in np.argsort(q[:count]):
         frequency, damping, softer, lossier = q[:-2].reshape(4, count)[:, k].tolist()
-        modes.append(Mode(frequency, damping, softer, lossier, driven[k], shown[k]))
+        modes.append(Mode(frequency, damping, softer, lossier, driven[k], displayed[k]))
     return Modes(tuple(modes), factors[2 * count :].T, 1e-4 * float(q[-2]), float(q[-1]))
 
 
-def solved(table: ComplexArray, seen: ComplexArray) -> tuple[FloatArray, FloatArray]:
+def solved(table: ComplexArray, spectrum: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """Return the real factors of columns that come nearest to what is seen, and the rest."""
-    a, y = (np.vstack([part.real, part.imag]) for part in (table, seen))
-    own, upper = np.linalg.qr(a)
-    found = np.linalg.solve(upper, own.T @ y)
-    return found, (y - a @ found).ravel()
+    a, y = (np.vstack([part.real, part.imag]) for part in (table, spectrum))
+    item, upper = np.linalg.qr(a)
+    result = np.linalg.solve(upper, item.T @ y)
+    return result, (y - a @ result).ravel()
 
 
 def mirror(found: Modes) -> psa.Model:
@@ -184,7 +184,7 @@ def mirror(found: Modes) -> psa.Model:
     for j in AXES:
         drive = free[f"gain_{j + 1}"] * (1 + free["rise"] * above) * u[j]
         slope.append((drive - v[j]) / free["lag"])
-    rates, shown = [], [sum(found.rest[i, j] * v[j] for j in AXES) for i in AXES]
+    rates, items = [], [sum(found.rest[i, j] * v[j] for j in AXES) for i in AXES]
     for k, mode in enumerate(found.modes):
         omega = 2 * np.pi * mode.frequency * (1 + free["softness"] * mode.softer * above)
         damping = mode.damping * (1 + mode.lossier * above)
@@ -192,9 +192,9 @@ def mirror(found: Modes) -> psa.Model:
             b.real * v[j] + b.imag * slope[j] / omega for j, b in enumerate(mode.driven.tolist())
         )
         rates += [omega * w[k], omega * (driven - q[k] - 2 * damping * w[k])]
-        shown = [
+        items = [
             y + c.real * q[k] + c.imag * w[k]
-            for y, c in zip(shown, mode.shown.tolist(), strict=True)
+            for y, c in zip(items, mode.shown.tolist(), strict=True)
         ]
     mean = sum(u[j] ** 2 for j in AXES) / len(AXES)
     pairs = [s for k in range(len(found.modes)) for s in (q[k], w[k])]
@@ -205,7 +205,7 @@ def mirror(found: Modes) -> psa.Model:
             "u": u,
             "p": ca.vertcat(*free.values()),
             "ode": ca.vertcat(*rates, *slope, (mean - power) / FELT),
-            "y": ca.vertcat(*shown),
+            "y": ca.vertcat(*items),
         },
         name="steering_mirror",
         states=[
@@ -248,14 +248,14 @@ def played(model: psa.Model, u: FloatArray) -> FloatArray:
     whole = np.vstack([u[:, :, -1], *np.moveaxis(u, 2, 0)])
     start = np.array([s.start for s in model.structure.states])
     y = psa.run(model, np.arange(len(whole)) / RATE, whole, start, hold="zero").y[n:]
-    shown: FloatArray = np.moveaxis((y - np.mean(y, axis=0)).reshape(count, n, axes), 0, 2)
-    return 1e-6 * shown
+    values: FloatArray = np.moveaxis((y - np.mean(y, axis=0)).reshape(count, n, axes), 0, 2)
+    return 1e-6 * values
 
 
-def score(y: FloatArray, said: FloatArray) -> FloatArray:
+def score(y: FloatArray, values: FloatArray) -> FloatArray:
     """Return the authors' score [1] of each output, of arrays (samples, axes, signals, periods)."""
-    errors, seen = (y - said)[SKIPPED:], y[SKIPPED:]
-    ratio = np.sqrt(np.mean(errors**2, axis=0)) / np.std(seen, axis=0)
+    errors, observed = (y - values)[SKIPPED:], y[SKIPPED:]
+    ratio = np.sqrt(np.mean(errors**2, axis=0)) / np.std(observed, axis=0)
     mean: FloatArray = np.mean(ratio, axis=(1, 2))
     return mean
 
@@ -303,8 +303,8 @@ def _outcome(
     for level in LEVELS:
         progress(f"test signals of {level} mV")
         u, y = (data[s, level, "test"] for s in "uy")
-        said = np.stack([played(model, u[:, :, k]) for k in range(u.shape[2])], axis=2)
-        ours[level] = score(y, said)
+        statement = np.stack([played(model, u[:, :, k]) for k in range(u.shape[2])], axis=2)
+        ours[level] = score(y, statement)
         lines = np.einsum("kij,kjep->kiep", responses[level], np.fft.rfft(u, axis=0))
         floor[level] = score(y, np.fft.irfft(lines, n=len(u), axis=0))
     rows = [

@@ -108,27 +108,27 @@ def run(progress: Progress, quick: bool, only: str = "", seed: Sequence[int] = (
     jobs = [(case, draw) for draw in seed for case in CASES if re.search(only, case)]
     if not jobs:
         raise psa.InputError(f"--only: no case has '{only}'; a case is one like {min(CASES)}.")
-    found = on_all_cores(sat, jobs[:: -(-len(jobs) // QUICK)] if quick else jobs, progress)
-    return Outcome(tables(found), lambda: picture(found))
+    result = on_all_cores(sat, jobs[:: -(-len(jobs) // QUICK)] if quick else jobs, progress)
+    return Outcome(tables(result), lambda: picture(result))
 
 
 def sat(case: str, draw: int) -> Sat:
     """Write the record of a case and diagnose it; draw 0 has the seeds of the golden answers."""
     with tempfile.TemporaryDirectory() as folder:
-        asked, path = CASES[case](Path(folder), draw)
+        requested, path = CASES[case](Path(folder), draw)
         _, answer, seconds = answered(path)
-    return Sat(case, draw, asked, answer, seconds)
+    return Sat(case, draw, requested, answer, seconds)
 
 
 def tables(found: Sequence[Sat]) -> list[TitledTable]:
     """Return the figures of each group and source, the reliability, and every answer."""
     groups = [(g, [f for f in found if f.group == g]) for g in GROUPS]
     rows = []
-    for group, own in groups:
-        sources = dict.fromkeys(f.source for f in own)
-        parts = [(s, [f for f in own if f.source == s]) for s in sources]
+    for group, item in groups:
+        sources = dict.fromkeys(f.source for f in item)
+        parts = [(s, [f for f in item if f.source == s]) for s in sources]
         rows += [_row(GROUPS[group], s, part) for s, part in parts]
-        rows += [_row(GROUPS[group], "all", own)] if len(parts) > 1 else []
+        rows += [_row(GROUPS[group], "all", item)] if len(parts) > 1 else []
     rows.append(_row("all", "all", found))
     each = [
         {"case": f.case, "draw": f.draw, "mark": f.mark, "verdict": f.answer.verdict,
@@ -149,15 +149,15 @@ def tables(found: Sequence[Sat]) -> list[TitledTable]:
     ]  # fmt: skip
 
 
-def _row(group: str, source: str, own: Sequence[Sat]) -> Row:
-    scores = [f.score for f in own]
-    kinds = {f.asked.group for f in own}
-    hidden, all_hidden = kinds <= {"one", "two", "three"}, [len(f.asked.accepted) for f in own]
-    sure = [[right for p, right in every if p >= SURE] for every in stated(own).values()]
-    times = np.quantile([f.seconds for f in own], (0.5, 0.95, 1.0))
+def _row(group: str, source: str, sats: Sequence[Sat]) -> Row:
+    scores = [f.score for f in sats]
+    kinds = {f.asked.group for f in sats}
+    hidden, all_hidden = kinds <= {"one", "two", "three"}, [len(f.asked.accepted) for f in sats]
+    sure = [[right for p, right in every if p >= SURE] for every in stated(sats).values()]
+    times = np.quantile([f.seconds for f in sats], (0.5, 0.95, 1.0))
 
-    def count(holds: Callable[[Score], bool], asked: bool) -> str:
-        return f"{sum(map(holds, scores))}/{len(own)}" if asked else "-"
+    def count(holds: Callable[[Score], bool], requested: bool) -> str:
+        return f"{sum(map(holds, scores))}/{len(sats)}" if requested else "-"
 
     return {
         "hidden": group,
@@ -182,26 +182,26 @@ def stated(found: Iterable[Sat]) -> dict[str, list[Stated]]:
     }
 
 
-def in_class(own: Iterable[Stated], low: float, high: float) -> list[Stated]:
+def in_class(item: Iterable[Stated], low: float, high: float) -> list[Stated]:
     """Return what is stated with a probability in (low, high]."""
-    return [(p, right) for p, right in own if low < p <= high]
+    return [(p, right) for p, right in item if low < p <= high]
 
 
-def log_score(own: Sequence[Stated]) -> float:
+def log_score(item: Sequence[Stated]) -> float:
     """Return the mean of -ln of the probability of what holds; 0 is best, ln 2 knows nothing.
 
     Source: I. J. Good, J. R. Stat. Soc. B 14 (1952) 107.
     """
-    p = np.clip([p if right else 1 - p for p, right in own], NEAREST, 1 - NEAREST)
-    return float(-np.mean(np.log(p))) if own else np.nan
+    p = np.clip([p if right else 1 - p for p, right in item], NEAREST, 1 - NEAREST)
+    return float(-np.mean(np.log(p))) if item else np.nan
 
 
-def brier_score(own: Sequence[Stated]) -> float:
+def brier_score(item: Sequence[Stated]) -> float:
     """Return the mean square of probability less outcome; 0 is best, 1/4 knows nothing.
 
     Source: G. W. Brier, Mon. Weather Rev. 78 (1950) 1.
     """
-    return float(np.mean([(p - right) ** 2 for p, right in own])) if own else np.nan
+    return float(np.mean([(p - right) ** 2 for p, right in item])) if item else np.nan
 
 
 def _reliability(found: Sequence[Sat]) -> TitledTable:
@@ -212,8 +212,8 @@ def _reliability(found: Sequence[Sat]) -> TitledTable:
             row |= {f"{level}: {k}": v for k, v in _class(in_class(every, low, high)).items()}
         rows.append(row)
     scores = "; ".join(
-        f"{level} log score {log_score(own):.3f}, Brier score {brier_score(own):.3f}"
-        for level, own in levels.items()
+        f"{level} log score {log_score(item):.3f}, Brier score {brier_score(item):.3f}"
+        for level, item in levels.items()
     )
     note = (
         "Every named cause that counts, by its name and its likeliest family, and the likeliest"
@@ -223,15 +223,15 @@ def _reliability(found: Sequence[Sat]) -> TitledTable:
     return TitledTable("Probability against frequency", rows, note)
 
 
-def _class(own: Sequence[Stated]) -> dict[str, str]:
+def _class(item: Sequence[Stated]) -> dict[str, str]:
     """Return the mean probability, how many are right, and the band of that share."""
-    if not own:
+    if not item:
         return dict.fromkeys(("mean", "right", "95 % band"), "-")
-    right = sum(right for _, right in own)
-    band = binomtest(right, len(own)).proportion_ci(method="wilson")
+    right = sum(right for _, right in item)
+    band = binomtest(right, len(item)).proportion_ci(method="wilson")
     return {
-        "mean": f"{100 * np.mean([p for p, _ in own]):.0f} %",
-        "right": f"{right}/{len(own)}",
+        "mean": f"{100 * np.mean([p for p, _ in item]):.0f} %",
+        "right": f"{right}/{len(item)}",
         "95 % band": f"{100 * band.low:.0f} to {100 * band.high:.0f} %",
     }
 

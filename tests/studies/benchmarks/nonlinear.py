@@ -46,8 +46,8 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         )
     ]  # fmt: skip
     if folder is not None and not quick:
-        found = [_public(progress, folder, *case) for case in PUBLIC]
-        tables.append(TitledTable("Public benchmarks", found, "Test: rms of simulated records."))
+        items = [_public(progress, folder, *case) for case in PUBLIC]
+        tables.append(TitledTable("Public benchmarks", items, "Test: rms of simulated records."))
     return Outcome(tables)
 
 
@@ -123,9 +123,9 @@ def emps(*paths: Path) -> tuple[psa.Model, Table, Table]:
     )  # fmt: skip
 
     def table(path: Path) -> Table:
-        found = loadmat(str(path))
-        rows: Mapping[str, FloatArray] = {n: found[n][::_EVERY, 0] for n in ("t", "vir", "qm")}
-        force = float(found["gtau"][0, 0]) * rows["vir"]
+        result = loadmat(str(path))
+        rows: Mapping[str, FloatArray] = {n: result[n][::_EVERY, 0] for n in ("t", "vir", "qm")}
+        force = float(result["gtau"][0, 0]) * rows["vir"]
         return {"time": rows["t"], "force": force, "position": rows["qm"]}
 
     fitted, test = map(table, paths)

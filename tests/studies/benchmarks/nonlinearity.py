@@ -111,8 +111,8 @@ class Controller:
         """Return the command; the notch is the difference equation a * e = b * (r - x)."""
         p, raw = self.p, reference - position
         known = self.a[1] * self.filtered[0] + self.a[2] * self.filtered[1]
-        given = self.b[0] * raw + self.b[1] * self.errors[0] + self.b[2] * self.errors[1]
-        error = float((given - known) / self.a[0])
+        inputs = self.b[0] * raw + self.b[1] * self.errors[0] + self.b[2] * self.errors[1]
+        error = float((inputs - known) / self.a[0])
         self.errors, self.filtered = [raw, self.errors[0]], [error, self.filtered[0]]
         self.integral += 0.5 * p["integral_gain"] * p["sample_time"] * (error + self.last)
         self.last = error
@@ -179,8 +179,8 @@ def picture(cases: Sequence[Case]) -> Figure:
     sizes.set_yticks(range(len(groups)), [f"{wave},\n{error}" for wave, error in groups])
     sizes.invert_yaxis()
     sizes.set_xscale("log")
-    found = [100.0 * c.nonlinearity for c in cases]
-    sizes.set_xlim(0.5 * min(found), 4.0 * max(found))
+    items = [100.0 * c.nonlinearity for c in cases]
+    sizes.set_xlim(0.5 * min(items), 4.0 * max(items))
     handles = [Patch(color=colour, label=name) for colour, name in LOOKS.values()]
     figure.legend(handles=handles, fontsize=11, loc="outside lower center", ncols=len(handles))
     return figure
@@ -230,17 +230,17 @@ def simulate_case(wave: str, closed: bool, compensated: bool, error: str = "exac
     values = _values(closed, compensated)
     for name, factor in ERRORS[error].items():
         values["stack"][name] *= factor
-    found = simulate_positioner(values, WAVES[wave], _PERIODS / FREQUENCY, PERIOD)
-    last = found.time >= found.time[-1] - 1.0 / FREQUENCY
-    time, position = found.time[last], found.position[last]
+    result = simulate_positioner(values, WAVES[wave], _PERIODS / FREQUENCY, PERIOD)
+    last = result.time >= result.time[-1] - 1.0 / FREQUENCY
+    time, position = result.time[last], result.position[last]
     reference = np.array([WAVES[wave](float(t)) for t in time])
     line = np.polynomial.Polynomial.fit(
         linear := linear_run(wave, closed).position[last], position, 1
     )
     deviation = position - line(linear)
     nonlinearity = float(np.abs(deviation).max() / np.ptp(position))
-    shown = (time, reference, position, deviation, nonlinearity)
-    return Case(closed, compensated, wave, error, *shown)
+    displayed = (time, reference, position, deviation, nonlinearity)
+    return Case(closed, compensated, wave, error, *displayed)
 
 
 def _values(closed: bool, compensated: bool) -> dict[str, dict[str, float]]:

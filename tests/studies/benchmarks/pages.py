@@ -134,13 +134,13 @@ def _page(model: psa.Model, n: int) -> str:
 
 def _errors(model: psa.Model, browser: Browser) -> dict[str, str]:
     t, v = _voltage(600)
-    asked = {"one run": case(model, t, v, quick=True, rtol=None),
+    table = {"one run": case(model, t, v, quick=True, rtol=None),
              "as psa.simulate, against it": case(model, t, v)}  # fmt: skip
-    found = run_in_browser(browser, model, list(asked.values()))
+    result = run_in_browser(browser, model, list(table.values()))
     here = (psa.simulate(model, t, v, rtol=r).displacement for r in (1e-8, 1e-6))
     return {
         name: f"{float(np.max(np.abs(f['shown'] - x)) / np.ptp(x)):.1e}"
-        for name, f, x in zip(asked, found, here, strict=True)
+        for name, f, x in zip(table, result, here, strict=True)
     }
 
 

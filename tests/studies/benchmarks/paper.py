@@ -50,11 +50,11 @@ class Case(NamedTuple):
 def run(progress: Progress, quick: bool) -> Outcome:
     """Measure the errors of both methods; `quick` takes two noise levels and one seed."""
     noises, seeds = ((0.0, 1e-4), 1) if quick else (NOISES, SEEDS)
-    found = [c for name in STACK_NAMES for c in _cases(name, noises, seeds, progress)]
+    items = [c for name in STACK_NAMES for c in _cases(name, noises, seeds, progress)]
     rows = [
         {"stack": c.stack, "noise": f"{c.noise:g}", "method": c.method}
         | {n: number(float(e), 2) for n, e in zip(COEFFICIENTS, c.errors, strict=True)}
-        for c in found
+        for c in items
     ]
     table = TitledTable(
         f"Relative error of the coefficients of eq. (15), step of {WINDOW:g} slowest time"
@@ -66,7 +66,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
         " off the truth; both methods see the same records. Noise 0 still holds the reference's"
         " tolerance, 1e-13.",
     )
-    return Outcome([table], partial(_picture, found))
+    return Outcome([table], partial(_picture, items))
 
 
 def step_record(values: Values) -> psa.Record:

@@ -66,8 +66,8 @@ def by_lsoda(
         return rates(p, v[k] + (now - k * h) * slope[k], x.tolist(), math)
 
     how: Any = {"rtol": rtol, "atol": atol}
-    found = solve_ivp(slopes, (0.0, t[-1]), start, "LSODA", t, **how)
-    return np.asarray(found.y[5]) if found.success else np.full(len(t), np.nan)
+    result = solve_ivp(slopes, (0.0, t[-1]), start, "LSODA", t, **how)
+    return np.asarray(result.y[5]) if result.success else np.full(len(t), np.nan)
 
 
 FREE = ("k_L", "A", "beta", "gamma", "delta", "n", "tau", "R_s", "c_P", "c_B", "m_P")
@@ -113,18 +113,18 @@ def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
         evaluate = made(*given)
 
         def wrapped(theta: FloatArray) -> Any:
-            found = evaluate(theta)
-            if found is not None:
-                trace.append((time.process_time() - began, float(found[0] @ found[0])))
-            return found
+            fit = evaluate(theta)
+            if fit is not None:
+                trace.append((time.process_time() - began, float(fit[0] @ fit[0])))
+            return fit
 
         return wrapped
 
     start = {name: factor * model.values[name] for name, factor in _WRONG.items()}
     with patch.object(fitting, "Objective", traced):
         sigma = [_NOISE * record.range_m]
-        found = fitting.fit(model, [whole(record)], FREE, sigma=sigma, start=start)
-    return found.evaluations, time.process_time() - began, trace
+        fit = fitting.fit(model, [whole(record)], FREE, sigma=sigma, start=start)
+    return fit.evaluations, time.process_time() - began, trace
 
 
 def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
@@ -241,10 +241,10 @@ class Work:
         """Return the displacements (sets, n) [m] of the independent reference: LSODA, restarted at
         every sample and every reversal."""
         times, names = self.record.time, self.models[0].state_names
-        given, marks = reference.from_samples(times, self.record.voltage), list(times)
+        inputs, marks = reference.from_samples(times, self.record.voltage), list(times)
         rows = [
             reference.simulate(
-                m.values, given, times, initial=dict(zip(names, x0, strict=True)),
+                m.values, inputs, times, initial=dict(zip(names, x0, strict=True)),
                 breakpoints=marks, rtol=rtol,
             ).displacement
             for m, x0 in zip(self.models, self.starts, strict=True)
@@ -267,8 +267,8 @@ def _cvodes(work: Work) -> At:
     z, p = ca.MX.sym("z", len(scale)), ca.MX.sym("p", s.p.numel())
     slopes = ca.Function("slopes", [s.time, s.x, s.u, s.p], [s.xdot], {"cse": True})
     line = ca.interpolant("line", "linear", [times], voltage, {"lookup_mode": ["exact"]})
-    given = ca.vertcat(line(t), 0.0)
-    dae = {"x": z, "p": p, "t": t, "ode": slopes(t, z * scale, given, p) / scale}
+    inputs = ca.vertcat(line(t), 0.0)
+    dae = {"x": z, "p": p, "t": t, "ode": slopes(t, z * scale, inputs, p) / scale}
     values = [m.parameter_vector() for m in work.models]
     starts, place = work.starts / scale, work.models[0].state_names.index("x")
 
@@ -277,8 +277,8 @@ def _cvodes(work: Work) -> At:
         solver = ca.integrator("solver", "cvodes", dae, 0.0, times[1:], options)
 
         def one(x0: FloatArray, p: FloatArray) -> FloatArray:
-            found = solver(x0=x0, p=p)["xf"].full()[place]
-            return np.asarray(scale[place] * np.concatenate([x0[place : place + 1], found]))
+            result = solver(x0=x0, p=p)["xf"].full()[place]
+            return np.asarray(scale[place] * np.concatenate([x0[place : place + 1], result]))
 
         return lambda: np.array([one(x0, p) for x0, p in zip(starts, values, strict=True)])
 
@@ -360,7 +360,7 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
         def ours(rtol: float, short: psa.Record = short) -> Solve:
             return partial(psa.simulate_many, model, sets[:_JUDGED], short, rtol=rtol)
 
-        own = math.nan
+        item = math.nan
         for name, (prepare, together) in {OURS: (None, count), **ways}.items():
             progress(f"{record.name}: {name}")
             at = ours if prepare is None else prepare(work.first(together))
@@ -372,13 +372,13 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
                 solve = partial(psa.simulate_many, model, sets[:count], record, **how)
             ((wall, spent),) = least_times([solve], _REPEATS, _SLOW)
             each = spent / together / whole_one.n
-            own = each if prepare is None else own
+            item = each if prepare is None else item
             rows.append({
                 "voltage": record.name, "way": name, "sets": together, "samples": whole_one.n,
                 "tolerance": f"{rtol:.0e}",
                 "largest error / range": number(error, 2) + " (missed)" * (error > WANTED),
                 "wall [s]": number(wall), "processor [s]": number(spent),
-                "us per sample and set": number(1e6 * each), "over ours": number(each / own, 2),
+                "us per sample and set": number(1e6 * each), "over ours": number(each / item, 2),
             })  # fmt: skip
     gpu, missing = on_gpu(progress, model, done, MORE * count)
     table = TitledTable(
@@ -410,9 +410,9 @@ def on_gpu(
         ours = keep(sets[:_COMPARED])
         keep(sets[:_COMPARED], device="cuda")  # compiles
         begin = time.perf_counter()
-        found = keep(columns, device="cuda")
+        result = keep(columns, device="cuda")
         wall = time.perf_counter() - begin
-        apart = np.max(np.abs(found[: len(ours)] - ours) / ours)
+        apart = np.max(np.abs(result[: len(ours)] - ours) / ours)
         rows.append({
             "voltage": record.name, "sets": count, "samples": record.n, "tolerance": f"{rtol:.0e}",
             "largest difference of a range from the cores'": f"{apart:.1e}",

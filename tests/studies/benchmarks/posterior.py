@@ -58,7 +58,7 @@ def evidence(task: Task) -> tuple[dict[str, float], float]:
     blocks = tuple(Block(b.rows, float(b.rows.stop - b.rows.start)) for b in task.density.blocks)
     density = replace(task.density, blocks=blocks)
     with one_thread():
-        found = chains_of(density, chains=CHAINS, draws=LONG, tune=LONG_TUNE, seed=1)
+        chains = chains_of(density, chains=CHAINS, draws=LONG, tune=LONG_TUNE, seed=1)
     # of a density in u: the Jacobian of z, and what normal priors are short of
     kept = np.isfinite(task.unknowns.prior)
     known = task.unknowns.prior[kept]
@@ -70,7 +70,7 @@ def evidence(task: Task) -> tuple[dict[str, float], float]:
     constant = float(np.linalg.slogdet(density.factor)[1]) - level
     constant -= float(np.sum(np.log(known * np.sqrt(2.0 * np.pi))))
     constant -= float(np.sum(np.log(norm.cdf(high) - norm.cdf(low))))  # cut at the bounds
-    bridge, error = bridge_sampled(density, found.u.reshape(-1, density.size))
+    bridge, error = bridge_sampled(density, chains.u.reshape(-1, density.size))
     peak, _ = density(np.zeros(density.size))
     rows = density.evaluate(task.theta)
     assert rows is not None
@@ -93,17 +93,17 @@ def bridge_sampled(density: Density, draws: FloatArray, seed: int = 0) -> tuple[
     normal = multivariate_normal(moments.mean(axis=0), np.cov(moments.T))
     rng = np.random.default_rng(seed)
     proposed = normal.rvs(len(crossing), random_state=rng)
-    own = np.array([density(u)[0] for u in crossing]) - normal.logpdf(crossing)
+    item = np.array([density(u)[0] for u in crossing]) - normal.logpdf(crossing)
     other = np.array([density(np.asarray(u))[0] for u in proposed]) - normal.logpdf(proposed)
-    value = float(np.median(own))
+    value = float(np.median(item))
     for _ in range(_ROUNDS):
         above = other - np.logaddexp(other, value)
-        below = -np.logaddexp(own, value)
+        below = -np.logaddexp(item, value)
         new = float(logsumexp(above) - logsumexp(below))
         if abs(new - value) < _CLOSE:
             break
         value = new
-    terms = (np.exp(other - np.logaddexp(other, value)), np.exp(value - np.logaddexp(own, value)))
+    terms = (np.exp(other - np.logaddexp(other, value)), np.exp(value - np.logaddexp(item, value)))
     spread = sum(float(np.var(x) / np.mean(x) ** 2 / len(x)) for x in terms)  # of both means
     return value, float(np.sqrt(spread))
 
@@ -176,11 +176,11 @@ def _calibration(progress: Progress, count: int) -> TitledTable:
     noise = NOISE * clean.range_m
     rng.standard_normal(clean.n)  # of a first record, which is not used
     before = task_for(noisy(clean, noise, rng), model, WIDTHS)
-    found: list[Replica] = []
+    replicas: list[Replica] = []
     for k, truth in enumerate(prior_draws(before, count, rng)):
         progress(f"calibration: {k + 1} of {count}")
-        found.append(_replica(before, truth, noise, k))
-    return _ranks(found)
+        replicas.append(_replica(before, truth, noise, k))
+    return _ranks(replicas)
 
 
 def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replica:
@@ -214,13 +214,13 @@ def _ranks(found: Sequence[Replica]) -> TitledTable:
         })  # fmt: skip
     every = {h: f"{share:.1f} %" for h, share in zip(heads, inside.mean(axis=0), strict=True)}
     rows.append(dict.fromkeys(rows[0], "") | {"unknown": "all", **every})
-    worth = float(np.median([r.inflation for r in found]))
+    gain = float(np.median([r.inflation for r in found]))
     bands = [np.array(binom.interval(0.95, len(found), q)) / len(found) for q in LEVELS]
     ends = ", ".join(f"{100 * a:.0f} to {100 * b:.0f} %" for a, b in bands)
     return TitledTable(
         f"Ranks of the truth among {possible - 1} draws, {len(found)} replicas; its intervals",
         rows,
         f"{sum(r.divergences for r in found)} of {len(found) * DRAWS} transitions diverged;"
-        f" {worth:.2f} samples count as one (median). Of one unknown, 95 % of such tables have"
+        f" {gain:.2f} samples count as one (median). Of one unknown, 95 % of such tables have"
         f" {ends} of the truths in the intervals.",
     )

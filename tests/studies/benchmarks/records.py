@@ -52,8 +52,8 @@ def played(
     bends = np.flatnonzero(np.abs(np.diff(voltage, 2)) > 1e-12 * np.ptp(voltage)) + 1
     drive = smooth or reference.from_samples(time, voltage)
     kinks = [] if smooth else time[bends].tolist()
-    found = reference.simulate(values, drive, time, breakpoints=kinks, rtol=rtol)
-    return psa.Record(name=name, time=time, voltage=voltage, displacement=found.displacement)
+    result = reference.simulate(values, drive, time, breakpoints=kinks, rtol=rtol)
+    return psa.Record(name=name, time=time, voltage=voltage, displacement=result.displacement)
 
 
 def step_voltage(
@@ -101,12 +101,12 @@ def clean_loops(values: Values) -> list[psa.Record]:
 def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
     values = dict(items)
     fast = {"step": step_voltage(values), "multisine": multisine_voltage(values, seed=1)}
-    return tuple(played(values, name, *given) for name, given in fast.items())
+    return tuple(played(values, name, *inputs) for name, inputs in fast.items())
 
 
 @lru_cache(maxsize=16)
 def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
-    values, found = dict(items), []
+    values, result = dict(items), []
     for share, f in product(LOOP_AMPLITUDES, LOOP_FREQUENCIES):
         half, omega = 0.5 * share * values["u_rated"], 2.0 * np.pi * f
 
@@ -114,8 +114,8 @@ def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
             return half * (1.0 - float(np.cos(omega * t)))
 
         name = f"loop {100 * share:.0f} % {f:g} Hz"
-        found.append(played(values, name, *loop_voltage(values, share, f), smooth))
-    return tuple(found)
+        result.append(played(values, name, *loop_voltage(values, share, f), smooth))
+    return tuple(result)
 
 
 def with_noise(

@@ -88,9 +88,9 @@ def drawn_by_psa(task: Task, draws: int, tune: int) -> Drawn:
     counted = _Counted(task)
     began = time.process_time()
     with one_thread():
-        found = chains_of(counted, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
+        chains = chains_of(counted, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
     spent = time.process_time() - began
-    theta = np.array([task.density.theta(u) for u in found.u[0]])
+    theta = np.array([task.density.theta(u) for u in chains.u[0]])
     return Drawn("psa.sample", theta, counted.count, spent)
 
 
@@ -115,13 +115,13 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
         pm.Potential("density", log_density(task, theta, pm, pt))
         step = pm.NUTS(target_accept=ACCEPT)  # compiles
         began = time.process_time()
-        found = pm.sample(
+        result = pm.sample(
             draws=draws, tune=tune, chains=1, cores=1, step=step, random_seed=SEED,
             progressbar=False, compute_convergence_checks=False, discard_tuned_samples=False,
         )  # fmt: skip
         spent = time.process_time() - began
-    moved = found.posterior["u"].to_numpy()[0]
-    groups = (found.sample_stats, found.warmup_sample_stats)
+    moved = result.posterior["u"].to_numpy()[0]
+    groups = (result.sample_stats, result.warmup_sample_stats)
     steps = sum(float(g["n_steps"].sum()) for g in groups)
     return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, steps, spent)
 
@@ -133,7 +133,7 @@ def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
     """
     values, unknowns = task.model.values, task.unknowns
     names = unknowns.names
-    own = {
+    table = {
         n: float(unknowns.reference[k]) * (pt.exp(theta[k]) if unknowns.log[k] else 1.0)
         + (0.0 if unknowns.log[k] else theta[k] * float(unknowns.scale[k]))
         for k, n in enumerate(names)
@@ -141,17 +141,19 @@ def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
     first = unknowns.first(0)
     (scale,) = unknowns.start_scale[0]
     (experiment,) = task.experiments
-    given = experiment.record
+    inputs = experiment.record
     solve = import_module("pymc.ode").DifferentialEquation(
         func=lambda y, t, p: [hysteresis_rate(y[0], t, p, values, pt)],
-        times=given.time[1:], n_states=1, n_theta=3, t0=float(given.time[0]),
+        times=inputs.time[1:], n_states=1, n_theta=3, t0=float(inputs.time[0]),
     )  # fmt: skip
     start = theta[first] * float(scale)
-    force = solve(y0=[start], theta=[own["A"], own["delta"], own["n"]])[:, 0]
+    force = solve(y0=[start], theta=[table["A"], table["delta"], table["n"]])[:, 0]
     whole = pt.concatenate([pt.stack([start]), force])
     compliance = 1.0 / values["k_P"] + 1.0 / values["k_B"]
-    shown = compliance * (own["k_L"] * pt.as_tensor(given.voltage) + whole)
-    errors = shown + theta[first + 1] * unknowns.offset_scale - pt.as_tensor(given.displacement)
+    displayed = compliance * (table["k_L"] * pt.as_tensor(inputs.voltage) + whole)
+    errors = (
+        displayed + theta[first + 1] * unknowns.offset_scale - pt.as_tensor(inputs.displacement)
+    )
     (block,) = task.density.blocks
     known = np.isfinite(unknowns.prior)
     prior = pt.sum((theta[known] / pt.as_tensor(unknowns.prior[known])) ** 2)

@@ -58,17 +58,17 @@ def on_all_cores(
     function: Callable[..., T],
     jobs: Iterable[tuple[Any, ...]],
     progress: Progress,
-    tell: Callable[[T], str] = str,
+    report: Callable[[T], str] = str,
     workers: int | None = None,
 ) -> list[T]:
     """Return function(*job) of every job, in their order, worked on side by side.
 
-    `tell` says in words what one has given.
+    `report` says in words what one has given.
     """
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         futures = [pool.submit(function, *job) for job in jobs]
         for k, future in enumerate(as_completed(futures), 1):
-            progress(f"{k} of {len(futures)}: {tell(future.result())}")
+            progress(f"{k} of {len(futures)}: {report(future.result())}")
     return [future.result() for future in futures]
 
 
@@ -111,8 +111,8 @@ def bench(name: str, of: str = "run") -> Any:
     """Return the function of a benchmark, or something else of its module, None if it has none."""
     place = {name: place for name, place, _ in _LINES}.get(name, "table")
     module, _, function = place.partition(":")
-    found = import_module(f"tests.studies.benchmarks.{module}")
-    return getattr(found, (function or of) if of == "run" else of, None)
+    result = import_module(f"tests.studies.benchmarks.{module}")
+    return getattr(result, (function or of) if of == "run" else of, None)
 
 
 def styled(

@@ -78,16 +78,16 @@ def synthetic(name: str, progress: Progress) -> list[Comparison]:
     fitted = [_step(p, 1.0), *(_loop(p, *loop) for loop in FITTED_LOOPS)]
     kept = [(LOOPS, _loop(p, *loop)) for loop in KEPT_LOOPS]
     kept += [(STEPS, _step(p, KEPT_STEP)), (OTHER, _non_periodic(p))]
-    given = [noisy(r, NOISE * r.range_m, draw) for r in fitted]
-    model = psa.identify(given, progress=lambda t: progress(f"{name}: {t}")).model
-    found = []
+    inputs = [noisy(r, NOISE * r.range_m, draw) for r in fitted]
+    model = psa.identify(inputs, progress=lambda t: progress(f"{name}: {t}")).model
+    items = []
     for kind, clean in kept:
         record = noisy(clean, NOISE * clean.range_m, draw)
         moved = psa.simulate(model, record.time, record.voltage, from_rest_at_zero=True)
         end = float(np.mean(measured(record)[-record.n // 20 :]))
         size = end if kind == STEPS else record.range_m
-        found.append(Comparison(kind, name, record, moved.displacement, size))
-    return found
+        items.append(Comparison(kind, name, record, moved.displacement, size))
+    return items
 
 
 def instrument(progress: Progress) -> list[Comparison]:
@@ -103,12 +103,12 @@ def instrument(progress: Progress) -> list[Comparison]:
         return []
     cut = split(sine)
     part = replace(sine, displacement=np.where(cut.used, measured(sine), np.nan))
-    found = psa.identify([part], progress=lambda text: progress(f"{INSTRUMENT}: {text}"))
+    result = psa.identify([part], progress=lambda text: progress(f"{INSTRUMENT}: {text}"))
     lead = np.arange(minor.n) < minor.n // 10
     led = Experiment(minor, minor.mask & lead, minor.mask & ~lead)
-    again = fit(found.model, [led], [], sigma=[found.fit.rms])
+    again = fit(result.model, [led], [], sigma=[result.fit.rms])
     cases = (
-        (LOOPS, "sine 1 Hz, blocks kept", cut, found.fit.predicted(found.experiments)),
+        (LOOPS, "sine 1 Hz, blocks kept", cut, result.fit.predicted(result.experiments)),
         (OTHER, "minor loops, after a tenth", led, again.predicted([led])),
     )
     compared = []
@@ -229,7 +229,7 @@ def matches(
     p = with_single_mass(values)
     time, top = step_voltage(p, samples=SAMPLES)
     none, push = np.zeros_like(time), 0.1 * p["k_L"] * top
-    found = []
+    items = []
     for plant in plants:
         x = plant_response(plant, p, time, top, none)
         step = psa.Record(name="step", time=time, voltage=top, displacement=x)
@@ -241,17 +241,17 @@ def matches(
             y, q = run.displacement, best.model.values
             mass = (q["m"] if "m" in q else q["m_P"] + q["m_B"]) * y[-1] / (loaded[-1] * p["m"])
             load = y / y[-1] - loaded / loaded[-1]
-            found.append(Match(plant, model, best.residuals / x[-1], load, float(mass)))
-    return found
+            items.append(Match(plant, model, best.residuals / x[-1], load, float(mass)))
+    return items
 
 
 def _best_fit(kind: str, p: Values, record: psa.Record, starts: int) -> Fit:
     """Fit from several starts that know the whole mass and stiffness; return the best."""
     fits = []
-    given: Any = {"sigma": [_SIGMA * record.range_m], "evaluations": 200, "tolerance": 1e-7}
+    inputs: Any = {"sigma": [_SIGMA * record.range_m], "evaluations": 200, "tolerance": 1e-7}
     for model in islice(_starts(kind, p, record), starts):
         with suppress(psa.PsaError):
-            fits.append(fit(model, [whole(record)], _FREE[kind], **given))
+            fits.append(fit(model, [whole(record)], _FREE[kind], **inputs))
     return min(fits, key=lambda f: f.cost)
 
 
@@ -269,8 +269,8 @@ def _starts(kind: str, p: Values, record: psa.Record) -> Iterator[psa.Model]:
         parts = {"k_P": p["k"] * (1.0 + stiff), "k_B": p["k"] * (1.0 + 1.0 / stiff)}
         parts |= {"m_P": share * p["m"], "m_B": (1.0 - share) * p["m"]}
         parts |= {f"c_{q}": 2.0 * ratio * sqrt(parts[f"m_{q}"] * parts[f"k_{q}"]) for q in "PB"}
-        seen = parts["k_P"] if kind == "reciprocal" else p["k"]
-        cascade = psa.compose(psa.BASE, {**common, **parts, "k_L": slope * seen})
+        observed = parts["k_P"] if kind == "reciprocal" else p["k"]
+        cascade = psa.compose(psa.BASE, {**common, **parts, "k_L": slope * observed})
         effect, newton = psa.EFFECTS["reciprocal_coupling"], {"reciprocal_gain": 1.0}
         yield cascade.with_effect(effect, newton) if kind == "reciprocal" else cascade
 
@@ -326,12 +326,12 @@ _MEASURED = (
 def run(progress: Progress, quick: bool) -> Outcome:
     """Identify, predict what was kept, and compare three mechanics; `quick` takes one stack."""
     stacks = ("P-885.51",) if quick else ("PTBS200", "WYDS0808020", "P-885.51")
-    shown = [c for name in stacks for c in synthetic(name, progress)]
-    shown += [] if quick else instrument(progress)
+    items = [c for name in stacks for c in synthetic(name, progress)]
+    items += [] if quick else instrument(progress)
     plants = ("reciprocal",) if quick else tuple(NAMES)
     values = psa.stack_model(RINGING).values
-    found = matches(values, progress, plants, 2 if quick else len(_SPLITS))
-    return Outcome([*verification_tables(shown), *tables(found, RINGING)], partial(picture, shown))
+    result = matches(values, progress, plants, 2 if quick else len(_SPLITS))
+    return Outcome([*verification_tables(items), *tables(result, RINGING)], partial(picture, items))
 
 
 #: Of each kind: title, the paper's row, and the picture's title and axes with that of the error.
@@ -349,7 +349,7 @@ _KINDS = {
 def verification_tables(shown: Sequence[Comparison]) -> list[TitledTable]:
     """Return one table each for the paper's loops, steps and non-periodic voltage."""
     note = _SYNTHETIC + _MEASURED * any(c.stack == INSTRUMENT for c in shown)
-    found = []
+    items = []
     for kind, (title, paper, *_) in _KINDS.items():
         cells = []
         for c in (c for c in shown if c.kind == kind):
@@ -360,8 +360,8 @@ def verification_tables(shown: Sequence[Comparison]) -> list[TitledTable]:
         cells.append(("paper, its measured stacks", *paper, ""))
         head = ("stack", "record, not fitted", "largest error", "of range [%]", "rms [%]")
         rows = [dict(zip(head, row, strict=True)) for row in cells]
-        found.append(TitledTable(title, rows, note if kind == LOOPS else ""))
-    return found
+        items.append(TitledTable(title, rows, note if kind == LOOPS else ""))
+    return items
 
 
 def picture(shown: Sequence[Comparison]) -> Figure:

@@ -80,24 +80,24 @@ class Answer:
     of_left: float = 0.0
 
 
-def mark(asked: Question, answer: Answer) -> str:
+def mark(question: Question, answer: Answer) -> str:
     """Return the mark of an answer."""
-    match asked.group:
+    match question.group:
         case "clean":
-            return _clean(asked, answer)
+            return _clean(question, answer)
         case "foreign":
-            return _foreign(asked, answer)
+            return _foreign(question, answer)
         case _:
-            return _hidden(asked, answer)
+            return _hidden(question, answer)
 
 
-def _clean(asked: Question, answer: Answer) -> str:
+def _clean(question: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return ADEQUATE
-    other = asked.other_hysteresis
+    other = question.other_hysteresis
     if not answer.causes:
         return HONEST if other else ALARM
-    hits = [c for c in answer.causes if _hit_of(c, asked.accepted) is not None]
+    hits = [c for c in answer.causes if _hit_of(c, question.accepted) is not None]
     wrong = [c for c in answer.causes if not (c in hits or (other and c.effect in HYSTERESIS))]
     if not wrong:
         return NEAREST if hits else HYSTERESIS_FOUND
@@ -105,34 +105,34 @@ def _clean(asked: Question, answer: Answer) -> str:
     return (WITH_EXTRA if right else WRONG) + _surely(wrong)
 
 
-def _foreign(asked: Question, answer: Answer) -> str:
+def _foreign(question: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return MISSED
     if not answer.causes:
         return RIGHTLY_UNEXPLAINED
-    nearest = frozenset[str]().union(*asked.accepted)
+    nearest = frozenset[str]().union(*question.accepted)
     wrong = [c for c in answer.causes if not _hits(c.effect, nearest)]
     return WRONG + _surely(wrong) if wrong else NEAREST
 
 
-def _hidden(asked: Question, answer: Answer) -> str:
+def _hidden(question: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
         return MISSED
     if not answer.causes:
         return UNEXPLAINED
-    found: set[int] = set()
+    numbers: set[int] = set()
     extra = []
     for cause in answer.causes:
-        hit = _hit_of(cause, asked.accepted)
+        hit = _hit_of(cause, question.accepted)
         if hit is not None:
-            found.add(hit)
-        elif not (asked.other_hysteresis and cause.effect in HYSTERESIS):
+            numbers.add(hit)
+        elif not (question.other_hysteresis and cause.effect in HYSTERESIS):
             extra.append(cause)
-    if len(found) == len(asked.accepted):
+    if len(numbers) == len(question.accepted):
         if extra:
             return WITH_EXTRA
         return IN_SET if any(c.rivals for c in answer.causes) else ALONE
-    if found:
+    if numbers:
         return HALF_WITH_EXTRA if extra else HALF
     return WRONG + _surely(extra) if extra else ONLY_HYSTERESIS
 
@@ -175,35 +175,35 @@ class Score:
     families: tuple[tuple[float, bool], ...]
 
 
-def score(asked: Question, answer: Answer, families: Mapping[str, str]) -> Score:
+def score(question: Question, answer: Answer, families: Mapping[str, str]) -> Score:
     """Return what an answer adds to the figures; `families` has that of each name."""
-    said, sets = mark(asked, answer), asked.accepted
+    statement, sets = mark(question, answer), question.accepted
     wide = [names | {families[n] for n in names if n in families} for names in sets]
 
     def of_family(family: str) -> int | None:
         return next((k for k, known in enumerate(wide) if family in known), None)
 
-    neutral = HYSTERESIS if asked.other_hysteresis else frozenset()
-    if asked.other_hysteresis:  # what is left of it is told rightly, but is none of the hidden
+    neutral = HYSTERESIS if question.other_hysteresis else frozenset()
+    if question.other_hysteresis:  # what is left of it is told rightly, but is none of the hidden
         wide.append(frozenset({"plant hysteresis"}))
-    found, covered, counted = set[int](), {of_family(answer.left)}, []
+    result, covered, counted = set[int](), {of_family(answer.left)}, []
     for cause in answer.causes:
         hit = _hit_of(cause, sets)
         place = of_family(cause.family) if hit is None else hit
         if hit is not None:
-            found.add(hit)
+            result.add(hit)
         covered.add(place)
         if hit is not None or cause.effect not in neutral:
             counted.append((cause, place))
     right = all(place is not None for _, place in counted)
     stated = [(c.of_family, c.family) for c, _ in counted] or [(answer.of_left, answer.left)]
     return Score(
-        found=len(found),
-        in_set=said in (ALONE, IN_SET),
-        alone=said == ALONE,
+        found=len(result),
+        in_set=statement in (ALONE, IN_SET),
+        alone=statement == ALONE,
         family=right and bool(sets) and covered >= set(range(len(sets))),
-        honest=said != MISSED and right,
-        alarm=said not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
+        honest=statement != MISSED and right,
+        alarm=statement not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
         names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c, _ in counted),
         families=tuple((p, of_family(family) is not None) for p, family in stated if family),
     )

@@ -140,14 +140,14 @@ def _parted(cell: str) -> tuple[str, list[float], dict[str, Any]]:
 
 def _record(place: int, row: str) -> Record:
     about, stack, test, *more = (cell.strip() for cell in row.split("|"))
-    name, says = about.split(" ", 1)
+    name, states = about.split(" ", 1)
     causes, accepted = (cell.split(";") if cell else [] for cell in (*more, "", "")[:2])
     hysteresis, (stroke,), rare = _parted(stack)
     voltage, (frequency, rate, samples, low, high, noise), unusual = _parted(test)
     unusual["steps"] = int(unusual.get("steps", Test.steps))
     hidden = {cause: tuple(values) for cause, values, _ in map(_parted, causes)}
     return Record(
-        name, 1000 + 17 * place, says,
+        name, 1000 + 17 * place, states,
         Stack(hysteresis, stroke, **rare),  # type: ignore[arg-type]
         Test(voltage, frequency, rate, int(samples), (low, high), noise, **unusual), hidden,
         tuple(frozenset(one.strip() for one in names.split(",")) for names in accepted),

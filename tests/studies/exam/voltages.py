@@ -105,13 +105,13 @@ def _multisine(w: Window) -> Floats:
 def _reversals(w: Window) -> Floats:
     """First-order reversal curves: from the top down to ever lower voltages and back."""
     count = max(4, int(w.frequency * w.times[-1]))
-    begun = w.share < 0.06
+    started = w.share < 0.06
     share = (w.share - 0.06) / 0.94
     piece = np.clip((share * count).astype(np.intp), 0, count - 1)
     within = share * count - piece
     lowest = w.low + w.span * (0.9 - 0.85 * piece / count)
     curves = w.high + (lowest - w.high) * np.minimum(2 * within, 2 - 2 * within)
-    return np.where(begun, w.low + w.span * w.share / 0.06, curves)
+    return np.where(started, w.low + w.span * w.share / 0.06, curves)
 
 
 def _swept_phase(w: Window, ratio: float) -> Floats:

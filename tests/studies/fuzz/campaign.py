@@ -149,8 +149,8 @@ def run(
     def turn(block: _Block) -> float:
         """Return what a target has had of its share; its processes count from their start."""
         name = block.target.name
-        begun = sum(1e-3 for w in running if w.block.target.name == name)
-        return -1.0 if block.alone else (tally.seconds.get(name, 0.0) + begun) / shares[name]
+        started = sum(1e-3 for w in running if w.block.target.name == name)
+        return -1.0 if block.alone else (tally.seconds.get(name, 0.0) + started) / shares[name]
 
     try:
         while True:
@@ -258,8 +258,8 @@ class _Worker:
             return
         self.seconds = time.monotonic() - self._begun
         trace = (self.folder / "trace").read_text(errors="replace")[:6000]
-        own = [x.strip() for x in trace.splitlines() if "psa_casadi/" in x]
-        where = own[0].split("psa_casadi/")[-1].replace('"', "") if own else "an unknown place"
+        items = [x.strip() for x in trace.splitlines() if "psa_casadi/" in x]
+        where = items[0].split("psa_casadi/")[-1].replace('"', "") if items else "an unknown place"
         sentence, name = f"{how}, in {where}", self.block.target.name
         self.failures.append(Failure(name, kind, sentence, self.index, sentence, trace))
 
@@ -273,7 +273,7 @@ class _Worker:
 
 
 def _work(
-    block: _Block, seed: int, until: float, folder: Path, said: Connection, parent: int
+    block: _Block, seed: int, until: float, folder: Path, connection: Connection, parent: int
 ) -> None:
     """Attack the inputs; Ctrl-C is for the parent, commands that are started heed signals."""
     os.setpgid(0, 0)
@@ -284,18 +284,20 @@ def _work(
         faulthandler.enable(trace, all_threads=False)
         faulthandler.register(signal.SIGUSR1, trace, all_threads=False)
         try:
-            _attack_all(block, seed, min(until, time.monotonic() + _SLICE), folder, said, parent)
+            _attack_all(
+                block, seed, min(until, time.monotonic() + _SLICE), folder, connection, parent
+            )
         except BaseException:  # noqa: BLE001 - whatever it is, the parent must hear of it
-            said.send(("fails", traceback.format_exc()))
+            connection.send(("fails", traceback.format_exc()))
     os._exit(0)
 
 
 def _attack_all(
-    block: _Block, seed: int, until: float, folder: Path, said: Connection, parent: int
+    block: _Block, seed: int, until: float, folder: Path, connection: Connection, parent: int
 ) -> None:
-    target, own, work = block.target, folder / "tmp", folder / "work"
-    own.mkdir()
-    os.environ["TMPDIR"], tempfile.tempdir = str(own), str(own)
+    target, item, work = block.target, folder / "tmp", folder / "work"
+    item.mkdir()
+    os.environ["TMPDIR"], tempfile.tempdir = str(item), str(item)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nowhere, stream)
@@ -305,26 +307,26 @@ def _attack_all(
     for index in range(block.first, block.last):
         if (time.monotonic() > until and not block.alone) or os.getppid() != parent:
             break
-        said.send(("begins", index))
+        connection.send(("begins", index))
         data = target.make(generator(seed, target.name, index))
         work.mkdir(exist_ok=True)
         accepted = False
         try:
-            for found in target.attack(data, work):
-                said.send(("fails", _failure(target, found, index)))
+            for result in target.attack(data, work):
+                connection.send(("fails", _failure(target, result, index)))
             accepted = True
         except PsaError:
             pass
         except Exception as error:  # noqa: BLE001 - counted as a failure
-            said.send(("fails", _foreign(target, error, index)))
-        if left := sorted(os.listdir(own)):
-            shutil.rmtree(own, ignore_errors=True)
-            own.mkdir(exist_ok=True)
-            found = Found(LEFT_OVER, f"left in TMPDIR: {', '.join(left[:3])}")
-            said.send(("fails", _failure(target, found, index)))
-        said.send(("ends", int(accepted)))
+            connection.send(("fails", _foreign(target, error, index)))
+        if left := sorted(os.listdir(item)):
+            shutil.rmtree(item, ignore_errors=True)
+            item.mkdir(exist_ok=True)
+            result = Found(LEFT_OVER, f"left in TMPDIR: {', '.join(left[:3])}")
+            connection.send(("fails", _failure(target, result, index)))
+        connection.send(("ends", int(accepted)))
     used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    said.send(("whole", sum(u.ru_utime + u.ru_stime for u in used)))
+    connection.send(("whole", sum(u.ru_utime + u.ru_stime for u in used)))
 
 
 def _failure(target: Target, found: Found, index: int) -> Failure:
@@ -335,12 +337,15 @@ def _failure(target: Target, found: Found, index: int) -> Failure:
 def _foreign(target: Target, error: Exception, index: int) -> Failure:
     """Return the failure that an error is, with the innermost function of the package."""
     frames = traceback.extract_tb(error.__traceback__)
-    own = [f for f in frames if f"{os.sep}psa_casadi{os.sep}" in f.filename] or list(frames)
-    where = f"{own[-1].filename.split(f'psa_casadi{os.sep}')[-1]}:{own[-1].name}"
-    alike, whole = f"{type(error).__name__} in {where}", "".join(traceback.format_exception(error))
-    sentence = f"{alike}: {' '.join(str(error).split())[:200]}"
+    item = [f for f in frames if f"{os.sep}psa_casadi{os.sep}" in f.filename] or list(frames)
+    where = f"{item[-1].filename.split(f'psa_casadi{os.sep}')[-1]}:{item[-1].name}"
+    similar, whole = (
+        f"{type(error).__name__} in {where}",
+        "".join(traceback.format_exception(error)),
+    )
+    sentence = f"{similar}: {' '.join(str(error).split())[:200]}"
     printable = [t.encode("utf-8", "backslashreplace").decode() for t in (sentence, whole[-4000:])]
-    return Failure(target.name, FOREIGN, printable[0], index, alike, printable[1])
+    return Failure(target.name, FOREIGN, printable[0], index, similar, printable[1])
 
 
 def replay(path: Path, targets: Mapping[str, Target]) -> Tally:

@@ -116,7 +116,7 @@ def psa(
 
 
 def environment(folder: Path, around: Around) -> dict[str, str]:
-    found: dict[str, str | None] = {
+    table: dict[str, str | None] = {
         **os.environ,
         "TMPDIR": str(folder / "tmp"),
         "PYTHONPATH": str(_ROOT),
@@ -126,18 +126,18 @@ def environment(folder: Path, around: Around) -> dict[str, str]:
         "ZIG_GLOBAL_CACHE_DIR": str(_COMPILERS_OWN),
         **around.environment,
     }
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in table.items() if value is not None}
 
 
 def _session(number: int) -> tuple[int, ...]:
     """Return the processes of a session that still run, where they can be listed."""
-    found = []
+    items = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = (entry / "stat").read_text().rsplit(")", 1)[1].split()
             if int(words[3]) == number and words[0] != "Z":
-                found.append(int(entry.name))
-    return tuple(found)
+                items.append(int(entry.name))
+    return tuple(items)
 
 
 def misbehaved(
@@ -304,18 +304,18 @@ def _kill(data: bytes, where: Path) -> Iterator[Found]:
             (folder / output).write_text(_OLD)
         ended = psa(work.arguments, folder, stop=(number, at))
         what = f"{case['command']} after {name}"
-        begun = at > _STARTING_S * _slowness()  # before that Python itself is ended
-        yield from misbehaved(ended, _CODES[name] + (() if begun else (-number,)), what)
+        started = at > _STARTING_S * _slowness()  # before that Python itself is ended
+        yield from misbehaved(ended, _CODES[name] + (() if started else (-number,)), what)
         yield from half_written(folder, work, what, may_miss=not case["old"] and ended.code != 0)
         after = WORKS["export modelica"]
         if name == "SIGKILL" and (then := psa(after.arguments, folder)).code:
             yield Found(WRONG_EXIT, f"{what}: the next command fails: {then.err[-300:]}")
         yield from left_files(folder, what)
         known = {*given_files(), *work.outputs, *after.outputs, "out", "err", "tmp", "cache"}
-        beside = {*os.listdir(folder)} - known
-        beside |= {p.name for p in folder.glob("cache/models/*") if p.is_dir()}
-        if beside:
-            yield Found(LEFT_OVER, f"{what}: it leaves '{', '.join(sorted(beside)[:3])}'")
+        others = {*os.listdir(folder)} - known
+        others |= {p.name for p in folder.glob("cache/models/*") if p.is_dir()}
+        if others:
+            yield Found(LEFT_OVER, f"{what}: it leaves '{', '.join(sorted(others)[:3])}'")
 
 
 TARGETS = (Target("kills", "kills", ".json", _kill_case, _kill, 1.0, 4 * LIMIT_S, None, _slowness),)

@@ -23,13 +23,13 @@ WORDS = (
 
 def damaged_bytes(data: bytes, rng: Random, words: Sequence[bytes] = ()) -> bytes:
     """Return bytes with one to four damages, one of them most often."""
-    found = bytearray(data)
+    result = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3, 4))):
-        _damage(found, rng)
+        _damage(result, rng)
         if words and rng.random() < 0.2:
-            word, place = rng.choice(words), rng.randrange(len(found) + 1)
-            found[place : place + len(word) * rng.choice((0, 1))] = word
-    return bytes(found)
+            word, place = rng.choice(words), rng.randrange(len(result) + 1)
+            result[place : place + len(word) * rng.choice((0, 1))] = word
+    return bytes(result)
 
 
 def _damage(data: bytearray, rng: Random) -> None:
@@ -93,9 +93,9 @@ def damaged_table(text: str, rng: Random) -> bytes:
                 lines[1:] = [mark.join(r) for r in filled]
         lines[row] = mark.join(cells)
     end = rng.choice(("\n", "\n", "\n", "\r\n", "\r", "\n\n", " \n"))
-    found = end.join(lines)
-    found = found.replace(mark, rng.choice(",;\t |")) if rng.random() < 0.1 else found
-    return found.encode("utf-8", "replace")
+    result = end.join(lines)
+    result = result.replace(mark, rng.choice(",;\t |")) if rng.random() < 0.1 else result
+    return result.encode("utf-8", "replace")
 
 
 def damaged_words(text: str, rng: Random, words: Sequence[str]) -> str:

@@ -175,16 +175,16 @@ def _difference(path: Path) -> str:
     """
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
-        found = {n: archive.read(n) for n in names}
-    sound = next((e for e in (entries(_STACK, 2), entries(_STACK, 3)) if set(e) <= set(found)), {})
+        table = {n: archive.read(n) for n in names}
+    sound = next((e for e in (entries(_STACK, 2), entries(_STACK, 3)) if set(e) <= set(table)), {})
     if not sound or len(names) != len(set(names)):
         return "entries that are missing or there twice"
     for name, content in sound.items():
-        if name == MODEL_ENTRY and _same_model(found[name], content):
+        if name == MODEL_ENTRY and _same_model(table[name], content):
             continue
-        if found[name] != content and not name.startswith(("binaries/", "documentation", "extra")):
+        if table[name] != content and not name.startswith(("binaries/", "documentation", "extra")):
             return f"another {name.split('/')[0]}"
-        if name.startswith("binaries/") and len(found[name]) != len(content):
+        if name.startswith("binaries/") and len(table[name]) != len(content):
             return "a binary of another length"
     return ""
 

@@ -143,8 +143,8 @@ def _record_file(suffix: str, rng: Random) -> bytes:
         parts[name] = damaged_bytes(parts[name], rng, (b"<", b">", b"&", b'"', b"<row>", b"f8"))
         stream = io.BytesIO()
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-            for own, content in parts.items():
-                archive.writestr(zipfile.ZipInfo(own), content)
+            for item, content in parts.items():
+                archive.writestr(zipfile.ZipInfo(item), content)
         return stream.getvalue()
     if suffix == ".parquet" and kind < 0.7:  # what describes the columns, with its own length
         start = len(data) - 8 - struct.unpack_from("<I", data, len(data) - 8)[0]
@@ -222,8 +222,8 @@ def model_trees() -> tuple[Any, ...]:
         *(psa.part_model(name) for name in psa.PARTS),
         *(with_ports(make()) for make in (cylinder, motor, oscillator, oven, pair, tanks)),
     ]
-    found = [json.loads(dumps(m)) for m in models]
-    return (*found, {"format": "psa_casadi.diagnosis/1", "verdict": "adequate", "causes": []})
+    items = [json.loads(dumps(m)) for m in models]
+    return (*items, {"format": "psa_casadi.diagnosis/1", "verdict": "adequate", "causes": []})
 
 
 def _load_model(data: bytes, folder: Path) -> Iterator[Found]:

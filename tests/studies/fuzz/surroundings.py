@@ -228,8 +228,8 @@ def _surround(data: bytes, where: Path) -> Iterator[Found]:
             os.close(stream)
         mute = "stderr" in around.streams
         yield from misbehaved(ended, (0, 1, 2) if chosen.words else (0,), what, mute=mute)
-        said = (ended.err + ended.out).lower()
-        if ended.code in (1, 2) and not any(word in said for word in chosen.words):
+        statement = (ended.err + ended.out).lower()
+        if ended.code in (1, 2) and not any(word in statement for word in chosen.words):
             tail = " ".join(ended.err.split())[-200:]
             yield Found(WRONG_EXIT, f"{what}: the failure does not name its cause: {tail}")
         yield from half_written(target, work, what, may_miss=ended.code != 0)

@@ -36,11 +36,11 @@ def run(
     """Return the answers, each worked on in a process of its own; a case that fails says so."""
     with ThreadPoolExecutor(workers) as pool:
         jobs = {pool.submit(_apart, case): case for case in ids}
-        found = {}
+        result = {}
         for job in as_completed(jobs):
-            found[jobs[job]] = job.result()
+            result[jobs[job]] = job.result()
             told(jobs[job], job.result())
-    return {case: found[case] for case in ids}
+    return {case: result[case] for case in ids}
 
 
 def _apart(case: str) -> Row:
@@ -70,28 +70,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--twelfth", action="store_true", help="the quick ones, one of twelve")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--answer", choices=CASES, metavar="CASE", help="print one answer as JSON")
-    given = parser.parse_args(arguments)
-    if given.answer:
-        print(json.dumps(answered(given.answer)))
+    inputs = parser.parse_args(arguments)
+    if inputs.answer:
+        print(json.dumps(answered(inputs.answer)))
         return 0
-    before, ids = kept(), [case.id for case in chosen(given.only)]
-    if given.twelfth:
+    before, ids = kept(), [case.id for case in chosen(inputs.only)]
+    if inputs.twelfth:
         ids = twelfth([i for i in ids if i in before], before)
     if not ids:
-        parser.error(f"no case has the pattern '{given.only}'; there are {', '.join(CASES)}")
+        parser.error(f"no case has the pattern '{inputs.only}'; there are {', '.join(CASES)}")
     ids.sort(key=lambda i: -float(before.get(i, {}).get(SECONDS, "1e9")))
 
     def told(case: str, row: Row) -> None:
-        said = next((row[n] for n in ("failed", "causes", "told", "code") if n in row), "")
-        print(f"{case}: {row.get('verdict', '')} {said} [{row[SECONDS]} s]", file=sys.stderr)
-        if given.accept and "failed" not in row:
+        statement = next((row[n] for n in ("failed", "causes", "told", "code") if n in row), "")
+        print(f"{case}: {row.get('verdict', '')} {statement} [{row[SECONDS]} s]", file=sys.stderr)
+        if inputs.accept and "failed" not in row:
             keep({case: row})
 
-    now = run(ids, given.workers, told)
+    now = run(ids, inputs.workers, told)
     _shown(table(before, now))
     print()
     _shown(totals(before, now))
-    return int(bool(table(before, now, times=False)) and not given.accept)
+    return int(bool(table(before, now, times=False)) and not inputs.accept)
 
 
 if __name__ == "__main__":

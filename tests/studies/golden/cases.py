@@ -44,13 +44,13 @@ class Case:
 def answered(*given: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
     """Return a diagnosis as it is written, what it names, and its processor time [s]."""
     begin = time.process_time()
-    told = psa.diagnose(*given, **words).to_dict()
+    table = psa.diagnose(*given, **words).to_dict()
     seconds = time.process_time() - begin
     causes = (
         Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"]), *_family(c))
-        for c in told["causes"]
+        for c in table["causes"]
     )
-    return told, Answer(told["verdict"], tuple(causes), *_family(told)), seconds
+    return table, Answer(table["verdict"], tuple(causes), *_family(table)), seconds
 
 
 def _family(of: dict[str, Any]) -> tuple[str, float]:
@@ -59,14 +59,14 @@ def _family(of: dict[str, Any]) -> tuple[str, float]:
     return (f"{first['place']} {first['kind']}", first["probability"]) if first else ("", 0.0)
 
 
-def diagnosed(asked: Question | None, *given: Any, **words: Any) -> Row:
+def diagnosed(question: Question | None, *given: Any, **words: Any) -> Row:
     """Return a diagnosis as text, with its mark where the truth is known (`exam.marks`)."""
-    told, answer, seconds = answered(*given, **words)
-    base, extended = _errors(told["errors"])
-    budget, patch = told["budget"], told.get("patch") or told.get("correction") or {}
+    output, answer, seconds = answered(*given, **words)
+    base, extended = _errors(output["errors"])
+    budget, patch = output["budget"], output.get("patch") or output.get("correction") or {}
     return {
-        "mark": "-" if asked is None else mark(asked, answer),
-        "verdict": told["verdict"],
+        "mark": "-" if question is None else mark(question, answer),
+        "verdict": output["verdict"],
         "causes": " + ".join(_named(c) for c in answer.causes) or "-",
         "unnamed": patch.get("name") or patch.get("port") or "-",
         "removed": "-" if budget is None else f"{budget['together']['share']:.4f}",
@@ -254,8 +254,8 @@ def _own(name: str, folder: Path) -> Row:
         words = {**words, "holdout": [last]}
     groups: dict[str, Group] = {"": "clean", "foreign": "foreign"}
     group = groups.get(hidden, "one")
-    asked = Question(group, (frozenset({hidden}),) if group == "one" else ())
-    return diagnosed(asked, model(), records, **words)
+    question = Question(group, (frozenset({hidden}),) if group == "one" else ())
+    return diagnosed(question, model(), records, **words)
 
 
 def _identified(folder: Path) -> Row:
@@ -263,15 +263,15 @@ def _identified(folder: Path) -> Row:
     record, file = folder / "record.csv", folder / "found.json"
     make_record(None, 990101, record, excitation="loops", visible=None)
     done("identify", record, "--json", file, "--quiet")
-    found = json.loads(file.read_text("utf-8"))
+    content = json.loads(file.read_text("utf-8"))
     names: dict[str, list[str]] = {}
-    for name, parameter in found["parameters"].items():
+    for name, parameter in content["parameters"].items():
         names.setdefault(parameter["determined"], []).append(name)
-    told = (found["parameters"][name] for name in names["determined"])
+    output = (content["parameters"][name] for name in names["determined"])
     return {
-        "told": "; ".join(f"{how}: {' '.join(own)}" for how, own in names.items()),
-        "parameters": _numbers([x for p in told for x in (p["value"], *p["interval"])]),
-        "base": _numbers([found["rms_m"]]),
+        "told": "; ".join(f"{how}: {' '.join(item)}" for how, item in names.items()),
+        "parameters": _numbers([x for p in output for x in (p["value"], *p["interval"])]),
+        "base": _numbers([content["rms_m"]]),
     }
 
 

@@ -23,13 +23,13 @@ _SURE = re.compile(r" (\d\.\d+)")
 
 def kept() -> dict[str, Row]:
     """Return the kept answers by case."""
-    found: dict[str, Row] = {}
+    rows: dict[str, Row] = {}
     for path in sorted(ANSWERS.glob("*.tsv")):
         head, *lines = path.read_text("utf-8").splitlines()
         for line in lines:
             row = dict(zip(head.split("\t"), line.split("\t"), strict=True))
-            found[f"{path.stem}/{row.pop('case')}"] = row
-    return found
+            rows[f"{path.stem}/{row.pop('case')}"] = row
+    return rows
 
 
 def keep(rows: Mapping[str, Row]) -> None:
@@ -37,11 +37,11 @@ def keep(rows: Mapping[str, Row]) -> None:
     every = {**kept(), **rows}
     ANSWERS.mkdir(exist_ok=True)
     for kind in dict.fromkeys(case.kind for case in CASES.values()):
-        own = [c for c in CASES.values() if c.kind == kind and c.id in every]
-        names = [n for n in every[own[0].id] if n != "hidden"] if own else []
+        items = [c for c in CASES.values() if c.kind == kind and c.id in every]
+        names = [n for n in every[items[0].id] if n != "hidden"] if items else []
         table = [("case", "hidden", *names)]
-        table += [(c.name, c.hidden, *(every[c.id][n] for n in names)) for c in own]
-        if own:
+        table += [(c.name, c.hidden, *(every[c.id][n] for n in names)) for c in items]
+        if items:
             text = "\n".join("\t".join(row) for row in table) + "\n"
             (ANSWERS / f"{kind}.tsv").write_text(text, "utf-8")
 
@@ -91,9 +91,9 @@ def table(
     """Return the lines of what changed: case, what, before, now."""
     lines = []
     for case, row in now.items():
-        told = changes(before.get(case, {}), row)
+        output = changes(before.get(case, {}), row)
         time = slower(before[case], row) if times and case in before else None
-        lines += [(case, *change) for change in (*told, *([time] if time else []))]
+        lines += [(case, *change) for change in (*output, *([time] if time else []))]
     return lines
 
 
@@ -102,15 +102,15 @@ def totals(before: Mapping[str, Row], now: Mapping[str, Row]) -> list[tuple[str,
     both = [case for case in now if case in before]
     errors = [c for c in both if "extended" in now[c] and "extended" in before[c]]
 
-    def line(what: str, cases: list[str], name: str, told: Callable[[list[Row]], str]) -> None:
+    def line(what: str, cases: list[str], name: str, output: Callable[[list[Row]], str]) -> None:
         if cases:
-            old, new = (told([rows[c] for c in cases]) for rows in (before, now))
+            old, new = (output([rows[c] for c in cases]) for rows in (before, now))
             lines.append((f"{what}, {len(cases)} cases", name, old, new))
 
     lines: list[tuple[str, str, str, str]] = []
     for kind in dict.fromkeys(case.split("/")[0] for case in both):
-        own = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
-        line(kind, own, "right", _right)
+        items = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
+        line(kind, items, "right", _right)
     line("all", both, "processor time", lambda r: f"{sum(float(x[SECONDS]) for x in r):.0f} s")
     line("all", errors, "held-out error, extended over base", lambda r: f"{_error_ratio(r):.4f}")
     return lines
@@ -136,5 +136,5 @@ def twelfth(ids: Iterable[str], before: Mapping[str, Row]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for case in ids:
         kinds.setdefault(case.split("/")[0], []).append(case)
-    dozens = (own[k : k + 12] for own in kinds.values() for k in range(0, len(own), 12))
+    dozens = (item[k : k + 12] for item in kinds.values() for k in range(0, len(item), 12))
     return [min(dozen, key=lambda c: float(before[c][SECONDS])) for dozen in dozens]

@@ -62,16 +62,16 @@ def _description(text: str) -> str:
 def _played(path: Path, inputs: Mapping[str, float]) -> str:
     """Return the FMU's outputs at five times, each input a growing sine of its size."""
     time = np.linspace(0.0, 0.05, 501)
-    given = np.zeros(len(time), dtype=[("time", float), *((name, float) for name in inputs)])
-    given["time"] = time
+    arguments = np.zeros(len(time), dtype=[("time", float), *((name, float) for name in inputs)])
+    arguments["time"] = time
     for name, size in inputs.items():
-        given[name] = size * time / time[-1] * (1.0 - np.cos(2.0 * np.pi * 60.0 * time))
-    found = fmpy.simulate_fmu(
+        arguments[name] = size * time / time[-1] * (1.0 - np.cos(2.0 * np.pi * 60.0 * time))
+    result = fmpy.simulate_fmu(
         str(path), fmi_type="CoSimulation", stop_time=0.05, step_size=1e-4, output_interval=1e-4,
-        relative_tolerance=1e-8, input=given,
+        relative_tolerance=1e-8, input=arguments,
     )  # fmt: skip
-    names = [n for n in found.dtype.names or () if n != "time"]
-    return " ".join(f"{found[n][k]:.9g}" for n in names for k in (100, 200, 300, 400, 500))
+    names = [n for n in result.dtype.names or () if n != "time"]
+    return " ".join(f"{result[n][k]:.9g}" for n in names for k in (100, 200, 300, 400, 500))
 
 
 def _fmu(name: str, fmi: int, folder: Path) -> dict[str, str]:
@@ -83,8 +83,8 @@ def _fmu(name: str, fmi: int, folder: Path) -> dict[str, str]:
         description = archive.read("modelDescription.xml").decode()
     size = 20.0 if "voltage" in model.input_names else 5.0
     inputs = {n: size if n == "voltage" else 0.0 for n in model.input_names}
-    told = fmpy.read_model_description(str(path))
-    known = {v.name for v in told.modelVariables if v.causality == "input"}
+    output = fmpy.read_model_description(str(path))
+    known = {v.name for v in output.modelVariables if v.causality == "input"}
     return {
         "description": _hash([_description(description)]),
         "code": _hash(texts),
@@ -103,8 +103,8 @@ def _c(name: str, folder: Path) -> dict[str, str]:
     made = psa.export_c(_MODELS[name](), folder, step=1e-4, name="model")
     texts = [made.header.read_text("utf-8"), made.source.read_text("utf-8")]
     errors = " ".join(f"{e.error:.3g}" for e in made.errors)
-    told = f"{made.substeps} substeps"
-    return {"description": told, "code": _hash(texts), "numbers": "-", "errors": errors}
+    text = f"{made.substeps} substeps"
+    return {"description": text, "code": _hash(texts), "numbers": "-", "errors": errors}
 
 
 EXPORTS: dict[str, Callable[[Path], dict[str, str]]] = {

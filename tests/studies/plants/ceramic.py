@@ -136,11 +136,11 @@ def _plays(
     edges = np.linspace(0.04, highest, count + 1) * d.run.stack.u_rated
     weights = d.rng.uniform(0.5, 1.5, count)
     weights /= weights.sum()
-    found = more()
+    values = more()
     for j in range(count):
-        found[f"r_{j}"] = d.uniform(edges[j], edges[j + 1])
-        found[f"w_{j}"] = float(weights[j])
-    return found
+        values[f"r_{j}"] = d.uniform(edges[j], edges[j + 1])
+        values[f"w_{j}"] = float(weights[j])
+    return values
 
 
 def growth(rate: FloatArray, q: float) -> FloatArray:

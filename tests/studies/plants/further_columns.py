@@ -53,7 +53,7 @@ class Truth:
         """Return the record with noise, and with these further columns."""
         rng = np.random.default_rng(seed)
         current = np.gradient(self.fine_charge, self.run.fine_step)
-        given = {
+        table = {
             "monitor_voltage": 0.01 * self.voltage + 0.003,
             "charge": self.fine_charge[:: self.run.sub_intervals] + 2e-6,
             "current": current[:: self.run.sub_intervals] + 1e-3,
@@ -64,11 +64,11 @@ class Truth:
         read = self.reading + NOISE * np.ptp(self.reading) * rng.standard_normal(self.reading.size)
         noisy: Mapping[str, FloatArray] = {
             n: x + FURTHER_NOISE * (np.ptp(x) or 1.0) * rng.standard_normal(x.size)
-            for n, x in given.items()
+            for n, x in table.items()
         }
-        beside: dict[str, Any] = {n: x for n, x in noisy.items() if n in columns}
+        others: dict[str, Any] = {n: x for n, x in noisy.items() if n in columns}
         whole = Record(
-            name="stack", time=self.run.times, voltage=self.run.command, displacement=read, **beside
+            name="stack", time=self.run.times, voltage=self.run.command, displacement=read, **others
         )
         return whole if samples is None else whole.slice(0, samples)
 
@@ -127,8 +127,8 @@ def growing_capacitance(truth: Truth, gain: float) -> Truth:
     force = stack.k_l * u + hysteresis_force(stack, path)
     fine = force_to_displacement(stack, force, run.fine_step)
     charge = stack.c_p_el * top / gain * np.expm1(gain * u / top) + stack.k_l * fine
-    x, seen = (q[:: run.sub_intervals] for q in (fine, u))
-    return replace(truth, displacement=x, reading=x, voltage=seen, fine_charge=charge)
+    x, observed = (q[:: run.sub_intervals] for q in (fine, u))
+    return replace(truth, displacement=x, reading=x, voltage=observed, fine_charge=charge)
 
 
 def _charge(run: Run) -> FloatArray:

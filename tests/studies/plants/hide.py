@@ -71,8 +71,8 @@ def hide(
     parameters = hidden.draw(rng, run)
     if gain is not None:
         added = hidden.contribution(run, parameters, gain)
-        shown = visible_ratio(directions, added, noise_rms)
-        return Hidden(hidden, gain, parameters, shown, gain_limited=False, added=added)
+        value = visible_ratio(directions, added, noise_rms)
+        return Hidden(hidden, gain, parameters, value, gain_limited=False, added=added)
     if isinstance(visible, tuple):
         low, high = visible
         wanted = math.exp(float(rng.uniform(math.log(low), math.log(high))))
@@ -86,8 +86,8 @@ def hide(
         gain, reached = refit_gain(hidden, run, parameters, gain, wanted, noise_rms)
         limited = abs(math.log(reached / wanted)) > math.log(ENOUGH)
     added = hidden.contribution(run, parameters, gain)
-    shown = reached if refit else visible_ratio(directions, added, noise_rms)
-    return Hidden(hidden, gain, parameters, shown, limited, added)
+    value = reached if refit else visible_ratio(directions, added, noise_rms)
+    return Hidden(hidden, gain, parameters, value, limited, added)
 
 
 def find_gain(
@@ -164,11 +164,11 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
     total = np.zeros_like(run.times)
     order = sorted(effects, key=lambda e: (e[0].driven is None, e[0].of_sensor))
     for effect, parameters, gain in order:
-        own = effect.contribution(run, parameters, gain)
-        total = total + own
+        values = effect.contribution(run, parameters, gain)
+        total = total + values
         if effect.driven is not None:
             run = run if gain == 0.0 else effect.driven(run, parameters, gain)
             continue
-        between = CubicSpline(run.times, own)(run.path.time)
+        between = CubicSpline(run.times, values)(run.path.time)
         run = replace(run, fine_displacement=run.fine_displacement + between)
     return total

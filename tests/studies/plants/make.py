@@ -109,13 +109,27 @@ def make_record(
         if one.room is not None:
             temperature = one.room(run.times, parameters)
     write_csv(path, run.times, run.command, read, temperature)
-    shown = (first[0].gain, first[0].parameters) if first else (0.0, {})
+    displayed = (first[0].gain, first[0].parameters) if first else (0.0, {})
     visibility = (first[0].visible, first[0].gain_limited) if first else (0.0, False)
     foreign = chosen is not None and chosen.foreign
     return Truth(
-        effect, foreign, *shown, stack, kind.rms, kind.quantum, *visibility, run.times, run.command,
-        clean, run.displacement, kind, lost, excitation, temperature, others,
-    )  # fmt: skip
+        effect,
+        foreign,
+        *displayed,
+        stack,
+        kind.rms,
+        kind.quantum,
+        *visibility,
+        run.times,
+        run.command,
+        clean,
+        run.displacement,
+        kind,
+        lost,
+        excitation,
+        temperature,
+        others,
+    )
 
 
 def write_csv(

@@ -81,8 +81,8 @@ def angle_error(angle: FloatArray, parameters: Parameters) -> FloatArray:
     """Error of the angle that the two signals tell [rad]."""
     first = np.cos(angle + parameters["c"]) + parameters["p"]
     second = (1.0 + parameters["k"]) * np.sin(angle) + parameters["q"]
-    found = np.arctan2(second, first) - angle
-    return np.asarray(found - 2.0 * math.pi * np.round(found / (2.0 * math.pi)), dtype=np.float64)
+    result = np.arctan2(second, first) - angle
+    return np.asarray(result - 2.0 * math.pi * np.round(result / (2.0 * math.pi)), dtype=np.float64)
 
 
 @hidden("g", "m", (1e-9, 3e-7), linear=True, called="sensor_ripple", of_sensor=True, drawn=_grating)
@@ -124,8 +124,8 @@ def converter_step(run: Run, p: Parameters, gain: float) -> FloatArray:
     three of them.
     """
     x, mid, quarter = np.append(0.0, run.displacement), p["mid"], p["quarter"]
-    beside = (x > mid - quarter).astype(float) + (x > mid + quarter)
-    steps = (x > mid) + p["next"] * beside
+    others = (x > mid - quarter).astype(float) + (x > mid + quarter)
+    steps = (x > mid) + p["next"] * others
     return np.asarray(gain * (steps - steps[0])[1:], dtype=np.float64)
 
 
@@ -298,5 +298,5 @@ def held(run: Run, renewals: int, skew: float, first: float) -> FloatArray:
     period = step * (1.0 - skew) / renewals
     start = (first - 1.0) * period
     instants = start + period * np.floor((run.times - start) / period)
-    shown = CubicSpline(run.path.time, run.fine_displacement)(np.maximum(instants, 0.0))
-    return np.asarray(shown, dtype=np.float64)
+    displayed = CubicSpline(run.path.time, run.fine_displacement)(np.maximum(instants, 0.0))
+    return np.asarray(displayed, dtype=np.float64)

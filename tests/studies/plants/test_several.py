@@ -43,8 +43,8 @@ def test_lags_of_a_linear_stack_multiply(linear: Run) -> None:
     expected = np.exp(-s * _DELAY) / (1.0 + s * _LAG)
     expected /= 1.0 + 2.0 * _ZETA * s * _DRIVE + (s * _DRIVE) ** 2
     moved = linear.displacement + added_by(linear, chain)
-    found = _amplitude(linear, moved) / _amplitude(linear, linear.displacement)
-    assert found == pytest.approx(expected, abs=2e-3)
+    result = _amplitude(linear, moved) / _amplitude(linear, linear.displacement)
+    assert result == pytest.approx(expected, abs=2e-3)
     summed = linear.displacement + sum(e.contribution(linear, p, g) for e, p, g in chain)
     apart = _amplitude(linear, summed) / _amplitude(linear, linear.displacement)
     assert abs(apart - expected) > 0.2

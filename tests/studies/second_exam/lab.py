@@ -78,8 +78,8 @@ VOLTAGES: dict[str, Callable[..., Floats]] = {
 
 def wave(spec: Sequence[Any], t: Floats, rng: Random) -> Floats:
     """Return the voltage of `spec`, its name and its arguments."""
-    name, *given = spec
-    return VOLTAGES[name](t, *given, *([rng] if name in DRAWN else []))
+    name, *inputs = spec
+    return VOLTAGES[name](t, *inputs, *([rng] if name in DRAWN else []))
 
 
 # --- noises, of unit standard deviation ----------------------------------------------------------

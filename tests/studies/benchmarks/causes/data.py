@@ -68,19 +68,19 @@ def cases_of(seed: int, count: int) -> list[Case]:
     cases = []
     for kind, number in numbers.items():
         for k in range(number):
-            own = next(seeds)
+            item = next(seeds)
             match kind:
                 case "known":
-                    cases.append(Case("known", known[k], own, noise=NOISES[k % len(NOISES)]))
+                    cases.append(Case("known", known[k], item, noise=NOISES[k % len(NOISES)]))
                 case "clean":
-                    cases.append(Case("clean", None, own, noise=NOISES[k % 2]))
+                    cases.append(Case("clean", None, item, noise=NOISES[k % 2]))
                 case "foreign":
-                    cases.append(Case("foreign", foreign[k], own))
+                    cases.append(Case("foreign", foreign[k], item))
                 case "weak":
-                    cases.append(Case("weak", weak[k], own, WEAK))
+                    cases.append(Case("weak", weak[k], item, WEAK))
                 case _:
                     one, more = pairs[k]
-                    cases.append(Case("two", one, own, STRONG, (more,)))
+                    cases.append(Case("two", one, item, STRONG, (more,)))
     return [cases[k] for k in rng.permutation(count)]
 
 
@@ -175,10 +175,12 @@ def _half(
 
 def _fitted(half: Half, base: FloatArray) -> FloatArray:
     """Return the Gauss-Newton step of the base from the device's own values, (11,)."""
-    told = np.isfinite(half.read)
+    output = np.isfinite(half.read)
     size = np.linalg.norm(half.columns, axis=0)
-    found = np.linalg.lstsq((half.columns / size)[told], (half.read - base)[told], rcond=1e-8)[0]
-    return np.asarray(found / size, dtype=np.float64)
+    result = np.linalg.lstsq((half.columns / size)[output], (half.read - base)[output], rcond=1e-8)[
+        0
+    ]
+    return np.asarray(result / size, dtype=np.float64)
 
 
 #: Letters of the equations beside the parameters.
@@ -280,13 +282,13 @@ def write_model(folder: Path) -> None:
 
 
 def _write_halves(folder: Path, name: str, record: Half, held: Half) -> None:
-    own = folder / "cases" / name
-    _table(own / "record.csv", record, displacement=record.read)
-    _table(own / "holdout.csv", held)
-    _table(own / "base_record.csv", record, base_displacement=record.base)
-    _table(own / "base_holdout.csv", held, base_displacement=held.base)
+    item = folder / "cases" / name
+    _table(item / "record.csv", record, displacement=record.read)
+    _table(item / "holdout.csv", held)
+    _table(item / "base_record.csv", record, base_displacement=record.base)
+    _table(item / "base_holdout.csv", held, base_displacement=held.base)
     np.savez(
-        own / "base.npz", names=np.array(COLUMNS), record=record.columns.astype(np.float32),
+        item / "base.npz", names=np.array(COLUMNS), record=record.columns.astype(np.float32),
         holdout=held.columns.astype(np.float32),
     )  # fmt: skip
     true = {"displacement": held.read, "displacement_without_noise": held.clean}

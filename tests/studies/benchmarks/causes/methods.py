@@ -36,7 +36,7 @@ def write_answer(method: str, answers: Path, data: Path, name: str) -> str:
         "format": FORMAT,
         "case": name,
         "detected": detected,
-        "causes": [{e: round(p, 6) for e, p in own.items()} for own in sets],
+        "causes": [{e: round(p, 6) for e, p in item.items()} for item in sets],
         "displacement_um": np.round(1e6 * predicted, 6).tolist(),
         "seconds": round(time.process_time() - begin, 2),
     }
@@ -73,15 +73,15 @@ def _sets(d: psa.StackDiagnosis) -> Sets:
     The first step's candidates have theirs; a later cause has its confidence, and what it cannot be
     told from shares the rest.
     """
-    told = {c.effect: c.probability for c in d.candidates}
+    table = {c.effect: c.probability for c in d.candidates}
     sets = []
     for k, cause in enumerate(d.causes):
         rest = max(0.0, 1.0 - cause.confidence) / max(1, len(cause.cannot_be_told_from))
-        own = {cause.effect: cause.confidence}
+        item = {cause.effect: cause.confidence}
         for other in cause.cannot_be_told_from:
-            own[other] = max(_LEAST, min(rest, told.get(other, rest) if k == 0 else rest))
-        over = max(1.0, sum(own.values()))
-        sets.append({e: p / over for e, p in own.items()})
+            item[other] = max(_LEAST, min(rest, table.get(other, rest) if k == 0 else rest))
+        over = max(1.0, sum(item.values()))
+        sets.append({e: p / over for e, p in item.items()})
     return sets
 
 
@@ -187,12 +187,12 @@ def by_sindy(case: Path) -> Answer:
     )
     causes = list(terms)
     owner = np.array([c for c in causes for _ in terms[c]])
-    told = np.isfinite(record[:, 2])
+    output = np.isfinite(record[:, 2])
     nuisance = np.asarray(moves["record"], dtype=np.float64)
     scale = np.linalg.norm(nuisance, axis=0)
-    base_part = np.linalg.qr((nuisance / scale)[told])[0]
-    raw = np.column_stack([column for c in causes for column in terms[c]])[told]
-    y = (record[:, 2] - bases[0])[told]
+    base_part = np.linalg.qr((nuisance / scale)[output])[0]
+    raw = np.column_stack([column for c in causes for column in terms[c]])[output]
+    y = (record[:, 2] - bases[0])[output]
     free, rest = (a - base_part @ (base_part.T @ a) for a in (raw, y))
     size = np.sqrt(np.mean(free**2, axis=0)) + 1e-12
     level = float(np.std(rest))
@@ -201,7 +201,7 @@ def by_sindy(case: Path) -> Answer:
     use = np.isin(owner, [max(s, key=lambda c: s[c]) for s in named])
     weights = np.linalg.lstsq(free[:, use] / size[use], rest, rcond=1e-6)[0] / size[use]
     after = np.column_stack([column for c in causes for column in later[c]])
-    shift = np.linalg.lstsq((nuisance / scale)[told], raw[:, use] @ weights, rcond=1e-8)[0]
+    shift = np.linalg.lstsq((nuisance / scale)[output], raw[:, use] @ weights, rcond=1e-8)[0]
     added = after[:, use] @ weights - np.asarray(moves["holdout"], float) @ (shift / scale)
     predicted = 1e-6 * (bases[1] + added)
     return bool(named), named, predicted, None
@@ -211,9 +211,9 @@ def _sparse(a: FloatArray, y: FloatArray, threshold: float) -> Any:
     """Return which columns PySINDy's optimiser keeps, (K,) bool."""
     from pysindy import STLSQ  # noqa: PLC0415  an optional need of this benchmark alone
 
-    found = STLSQ(threshold=threshold, alpha=0.05, max_iter=20)
-    found.fit(a, y[:, None])
-    return np.abs(found.coef_[0]) > 0.0
+    stlsq = STLSQ(threshold=threshold, alpha=0.05, max_iter=20)
+    stlsq.fit(a, y[:, None])
+    return np.abs(stlsq.coef_[0]) > 0.0
 
 
 def _criterion(a: FloatArray, y: FloatArray) -> float:

@@ -35,43 +35,43 @@ def faults(answer, name, causes, samples):
     """Return what is wrong with an answer, in sentences; `samples`: of the held-out record."""
     if not isinstance(answer, dict) or answer.get("format") != FORMAT:
         return [f'{name}: the format is not \'{FORMAT}\'; write "format": "{FORMAT}".']
-    said = []
+    items = []
     if answer.get("case") != name:
-        said.append(f'{name}: "case" is {answer.get("case")!r}; it must be the file\'s name.')
+        items.append(f'{name}: "case" is {answer.get("case")!r}; it must be the file\'s name.')
     if not isinstance(answer.get("detected"), bool):
-        said.append(f'{name}: "detected" must be true or false.')
+        items.append(f'{name}: "detected" must be true or false.')
     sets = answer.get("causes")
     if not isinstance(sets, list) or not all(isinstance(s, dict) and s for s in sets):
-        return [*said, f'{name}: "causes" must be a list of objects, each {{cause: probability}}.']
-    for own in sets:
-        said += [
+        return [*items, f'{name}: "causes" must be a list of objects, each {{cause: probability}}.']
+    for item in sets:
+        items += [
             f"{name}: there is no cause '{c}'; data.json lists them."
-            for c in own
+            for c in item
             if c not in causes
         ]
-        if not all(_number(p) and 0 <= p <= 1 for p in own.values()) or sum(own.values()) > 1.001:
-            said.append(f"{name}: probabilities of a set lie in 0 to 1 and add up to at most 1.")
+        if not all(_number(p) and 0 <= p <= 1 for p in item.values()) or sum(item.values()) > 1.001:
+            items.append(f"{name}: probabilities of a set lie in 0 to 1 and add up to at most 1.")
     y = answer.get("displacement_um")
     if y is not None and not (
         isinstance(y, list) and len(y) == samples and all(_number(v) for v in y)
     ):
-        said.append(f'{name}: "displacement_um" must hold {samples} numbers, as holdout.csv.')
-    return [*said, *_more_faults(answer, name)]
+        items.append(f'{name}: "displacement_um" must hold {samples} numbers, as holdout.csv.')
+    return [*items, *_more_faults(answer, name)]
 
 
 def _more_faults(answer, name):
-    said = []
+    items = []
     gain, patch = answer.get("gain_percent"), answer.get("patch")
     if gain is not None and not (
         isinstance(gain, dict) and all(_number(gain.get(k)) for k in ("value", "low", "high"))
     ):
-        said.append(f'{name}: "gain_percent" must hold the numbers value, low and high.')
+        items.append(f'{name}: "gain_percent" must hold the numbers value, low and high.')
     if patch is not None and not _is_curve(patch):
-        said.append(
+        items.append(
             f'{name}: "patch" must hold "column" (time, voltage, temperature or base'
             ' displacement) and as many increasing "at" as "adds_um".'
         )
-    return said
+    return items
 
 
 def _is_curve(patch):
@@ -89,25 +89,27 @@ def read(data, answers):
     """Return truth, answers and causes; print what is wrong with answers and exit."""
     about = json.loads((data / "data.json").read_text(encoding="utf-8"))
     truth = json.loads((data / "truth" / "truth.json").read_text(encoding="utf-8"))["cases"]
-    found, said = {}, []
+    result, statement = {}, []
     if not answers.is_dir():
-        said.append(f"{answers} is no folder; give the one with your answers, 001.json and so on.")
+        statement.append(
+            f"{answers} is no folder; give the one with your answers, 001.json and so on."
+        )
     for path in sorted(answers.glob("*.json")):
         if path.stem not in truth:
-            said.append(f"{path.name}: the data set has no such case.")
+            statement.append(f"{path.name}: the data set has no such case.")
             continue
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            said.append(f"{path.name} is no JSON: {error}.")
+            statement.append(f"{path.name} is no JSON: {error}.")
             continue
         samples = column(data / "truth" / f"{path.stem}.csv", "time").size
-        said += faults(content, path.stem, about["causes"], samples)
-        found[path.stem] = content
-    if said:
-        print("\n".join(said), file=sys.stderr)
+        statement += faults(content, path.stem, about["causes"], samples)
+        result[path.stem] = content
+    if statement:
+        print("\n".join(statement), file=sys.stderr)
         raise SystemExit(2)
-    return truth, found, about["causes"]
+    return truth, result, about["causes"]
 
 
 def held_out(data, name, answer):
@@ -129,7 +131,7 @@ def held_out(data, name, answer):
 def one(data, name, true, answer):
     """Return the marks of one case."""
     sets = answer.get("causes", [])
-    within = {c for own in sets for c in own}
+    within = {c for item in sets for c in item}
     error, base, noise = held_out(data, name, answer)
     hidden, gain = true["hidden"], answer.get("gain_percent")
     alone = next(iter(sets[0])) if len(sets) == 1 and len(sets[0]) == 1 else None
@@ -139,7 +141,7 @@ def one(data, name, true, answer):
         "answered": bool(answer), "detected": bool(answer.get("detected")), "named": bool(sets),
         "in_set": set(hidden) <= within, "right_alone": len(hidden) == 1 and alone == hidden[0],
         "single_wrong": alone is not None and alone not in hidden,
-        "exactly": sorted(max(own, key=own.get) for own in sets) == sorted(hidden),
+        "exactly": sorted(max(item, key=item.get) for item in sets) == sorted(hidden),
         "size": len(sets[0]) if len(sets) == 1 else None,
         "over_noise": error / noise, "base_over_noise": base / noise,
         "removed": (base**2 - error**2) / (base**2 - noise**2) if base > noise else np.nan,
@@ -166,11 +168,11 @@ def reliability(marks):
     pairs = [(p, c in m["hidden"]) for m in marks for c, p in m["stated"].items()]
     rows = []
     for low, high in itertools.pairwise(CLASSES):
-        own = [(p, right) for p, right in pairs if low < p <= high + 1e-9]
-        if own:
-            mean = float(np.mean([p for p, _ in own]))
+        items = [(p, right) for p, right in pairs if low < p <= high + 1e-9]
+        if items:
+            mean = float(np.mean([p for p, _ in items]))
             rows.append({"above": low, "up_to": high, "mean": mean,
-                         "right": sum(r for _, r in own), "of": len(own)})  # fmt: skip
+                         "right": sum(r for _, r in items), "of": len(items)})  # fmt: skip
     return rows
 
 
@@ -185,12 +187,12 @@ def figures(marks):
         [m for m in marks if m["kind"] == k] for k in ("known", "weak", "clean", "foreign", "two")
     )
     straight = [m for m in known if m["hidden"][0] not in BENDS]
-    told = [m for m in marks if m["gain_held"] is not None]
+    items = [m for m in marks if m["gain_held"] is not None]
     listed = [*known, *weak, *clean, *foreign]
     predicted = [*known, *weak, *two]
 
-    def count(own, key, wanted=True):
-        return [sum(m[key] == wanted for m in own), len(own)]
+    def count(item, key, wanted=True):
+        return [sum(m[key] == wanted for m in item), len(item)]
 
     return {
         "answered": count(marks, "answered"),
@@ -213,15 +215,15 @@ def figures(marks):
         "the fitted base's, median": _quantile([m["base_over_noise"] for m in predicted], 0.5),
         "clean: held-out error over the noise, median": _quantile([m["over_noise"] for m in clean], 0.5),
         "foreign: share of the excess removed, median": _quantile([m["removed"] for m in foreign], 0.5),
-        "interval of the gain holds it": count(told, "gain_held"),
+        "interval of the gain holds it": count(items, "gain_held"),
         "seconds of a case, median": _quantile([m["seconds"] for m in marks], 0.5),
     }  # fmt: skip
 
 
 def score(data: Path, answers: Path) -> dict[str, Any]:
     """Return figures, reliability and the marks of every case."""
-    truth, found, _ = read(data, answers)
-    marks = [one(data, name, true, found.get(name, {})) for name, true in truth.items()]
+    truth, result, _ = read(data, answers)
+    marks = [one(data, name, true, result.get(name, {})) for name, true in truth.items()]
     single = [m for m in marks if m["kind"] != "two"]
     return {"figures": figures(marks), "reliability": reliability(single), "cases": marks}
 
