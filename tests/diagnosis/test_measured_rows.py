@@ -1,4 +1,4 @@
-"""Rows of docs/measured.md on the measured micromanipulator are what a diagnosis says of it.
+"""Rows of docs/evidence.md on the measured micromanipulator are what a diagnosis says of it.
 
 Those of the sine, which is the README's picture, and of the minor loops, which the README
 diagnoses; `python -m tests.studies measured` has the others, which take a minute each.
@@ -16,7 +16,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects import EFFECTS
 from psa_casadi.records import read_record
 
-PAGE = Path(__file__).parents[2] / "docs" / "measured.md"
+PAGE = Path(__file__).parents[2] / "docs" / "evidence.md"
 
 
 def rows() -> dict[str, list[str]]:

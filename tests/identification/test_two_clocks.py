@@ -85,7 +85,7 @@ def test_the_finding_is_told_and_repeats(run: Run) -> None:
 
 
 def test_the_measured_sine_has_two_clocks(measured_data: Path) -> None:
-    """As docs/measured.md states it; the minor loops show too little of it to be told."""
+    """As docs/evidence.md states it; the minor loops show too little of it to be told."""
     sine, loops = (
         read_record(measured_data / "micromanipulator" / f"{name}.csv")
         for name in ("sine_1hz", "minor_loops")
@@ -93,7 +93,7 @@ def test_the_measured_sine_has_two_clocks(measured_data: Path) -> None:
     result = two_clocks(sine)
     assert result is not None
     output = result.sentence(sine).split(": ", 1)[1].split(". ")[0]
-    page = (Path(__file__).parents[2] / "docs" / "measured.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "evidence.md").read_text(encoding="utf-8")
     text = " ".join(page.split())
     assert output.split(": ")[1] in text
     assert two_clocks(loops) is None

@@ -1,6 +1,6 @@
 """Damaged inputs, kills and hostile surroundings: short runs; the long one is a benchmark.
 
-`python -m tests.studies fuzz --help` says how; docs/robustness.md what must hold.
+`python -m tests.studies fuzz --help` says how; docs/evidence.md what was measured.
 """
 
 import json

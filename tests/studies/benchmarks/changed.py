@@ -34,7 +34,7 @@ FIRST, CHANGE, _MEASURED_NOISE = 480201, 0.01, 67e-9
 #: one of so many, and of measured rows.
 CASES, DRAWS, EXAM_DRAWS, QUICK_EXAM, MEASURED_DRAWS = 40, 20, 3, 12, 9
 _KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "design", "ringing")
-#: Rows of `docs/measured.md`.
+#: Rows of `docs/evidence.md`.
 MEASURED = ("sine_1hz", "minor_loops", "both files")
 
 #: A case of the study, a record of the exam, or a row of the measured ones; and what was said of

@@ -61,7 +61,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 
 def _diagnoses(progress: Progress) -> tuple[list[TitledTable], psa.StackDiagnosis]:
-    """Diagnose what the table of `docs/measured.md` diagnoses; return the sine's as well.
+    """Diagnose what the table of `docs/evidence.md` diagnoses; return the sine's as well.
 
     And fit the sine again with every cause that others have and it has not, as it is found there,
     and with its sign turned: where both are as good, the sine does not see the cause.
