@@ -38,7 +38,7 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     parts = [
         markdown,
         f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
-        " voltage ([how](web.md)).",
+        " voltage ([how](howto/web.md)).",
         markdown_table(overview()),
     ]
     for place in dict.fromkeys(e.belongs_to for e in EFFECTS.values()):

@@ -4,7 +4,6 @@ from psa_casadi.component import Component
 from psa_casadi.components import online_identification as online
 from psa_casadi.components import outputs, stack, surroundings
 
-#: The paper's model behind a drive stage and in front of a sensor.
 BASE: tuple[Component, ...] = (
     stack.DRIVE,
     stack.LINEAR_FORCE,
@@ -13,9 +12,10 @@ BASE: tuple[Component, ...] = (
     stack.CASCADE_MECHANICS,
     stack.SENSOR,
 )
+"""The paper's model behind a drive stage and in front of a sensor."""
 
-#: The simplified model with one mass (paper eq. 6).
 SIMPLIFIED: tuple[Component, ...] = (*BASE[:4], stack.SINGLE_MASS, stack.SENSOR)
+"""The simplified model with one mass (paper eq. 6)."""
 
 COMPONENTS: dict[str, Component] = {
     c.name: c
@@ -43,5 +43,6 @@ COMPONENTS: dict[str, Component] = {
         outputs.VALIDITY_WITH_TEMPERATURE,
     )
 }
+"""Every component that is no effect, by name."""
 
 __all__ = ["BASE", "COMPONENTS", "SIMPLIFIED"]

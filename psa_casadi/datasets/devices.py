@@ -289,5 +289,5 @@ STEERING_MIRROR_TEST = _mirror(
 
 _ALL = (MICROMANIPULATOR, MICROMANIPULATOR_RESTS, STEERING_MIRROR, STEERING_MIRROR_TEST)
 
-#: Every dataset by name. A dataset stands here once its licence and its hashes were verified.
 DATASETS: dict[str, Dataset] = {d.name: d for d in _ALL}
+"""Every dataset by name. A dataset stands here once its licence and its hashes were verified."""

@@ -35,5 +35,6 @@ EFFECTS: dict[str, Component] = {
         environment.TEMPERATURE,
     )
 }
+"""The effects that a diagnosis of a stack tries, by name."""
 
 __all__ = ["EFFECTS"]

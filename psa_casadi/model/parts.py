@@ -46,6 +46,7 @@ PARTS = {
     name: PartKind(name, text, tuple(components) or (name,))
     for name, (text, *components) in _PARTS.items()
 }
+"""The parts around a stack by name, as `part_model` takes them."""
 
 #: Effects on the generated force that the observer can run: those of u and of states. (The one of
 #: rate_dependent_hysteresis follows u' at once, which is the compensated command itself: a loop.)

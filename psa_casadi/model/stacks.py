@@ -201,6 +201,7 @@ MICROMANIPULATOR = Stack(
 STACKS: dict[str, Stack] = {
     stack.name: stack for stack in (PTBS200, WYDS0808020, P88551, DEMO, MICROMANIPULATOR)
 }
+"""The named stacks, as `psa stacks` lists them."""
 
 
 def stack_model(name: str) -> Model:

@@ -59,7 +59,7 @@ def test_the_version_is_one() -> None:
 def test_the_page_goes_on_from_the_demo_whose_stack_is_what_its_record_gives(
     tmp_path: Path,
 ) -> None:
-    block = block_in_tests("docs/fmu.md")
+    block = block_in_tests("docs/howto/fmu_export.md")
     assert shlex.split(block.commands[0]) == ["psa", "demo"]
     assert run_block(block, tmp_path) is None
     record = read_record(tmp_path / "psa_demo" / "synthetic_record.csv")

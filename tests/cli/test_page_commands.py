@@ -18,7 +18,7 @@ TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 #: The pages whose one block a test runs.
 IN_TESTS = [
     "README.md",
-    "docs/fmu.md",
+    "docs/howto/fmu_export.md",
     "docs/howto/motor.md",
     "docs/howto/own_model.md",
     "docs/python.md",

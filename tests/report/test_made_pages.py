@@ -9,7 +9,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 import psa_casadi as psa
-from build_scripts import copied_pages, ports_page
+from build_scripts import copied_pages, ports_page, python_page
 from build_scripts.commands_page import commands
 from build_scripts.effects_page import PICTURES, overview, section
 from build_scripts.measured_data import ROOT
@@ -106,3 +106,14 @@ def test_the_page_of_ports_has_every_port_with_its_sign() -> None:
     names = {i.name for c in psa.COMPONENTS.values() for i in c.inputs}
     names |= {o.name for c in psa.COMPONENTS.values() for o in c.outputs}
     assert names <= {*re.findall(r"^\|.*?`(\w+)` \| (?:in|out) \|", text, re.MULTILINE)}
+
+
+def test_the_page_of_python_has_every_public_name_once() -> None:
+    written = " ".join(python_page.SECTIONS.values()).split()
+    assert len(written) == len({*written})
+    names = {n.removeprefix("design.") for n in written}
+    assert names == {*psa.__all__, *psa.design.__all__, *psa.online.__all__, *psa.system.__all__}
+    text = python_page.with_names((ROOT / "docs" / "python.md").read_text(encoding="utf-8"))
+    assert text.count("\n::: psa_casadi.") == len(names) + 2  # two have a second form
+    with pytest.raises(ValueError, match="headings of python"):
+        python_page.with_names("# Python\n\n## Records\n")

@@ -100,7 +100,7 @@ def check_fmu(
 
     A `foreign` one, by default every one that another tool made and for which no model is given, is
     checked by the standard alone: a row fails where a clause is violated, and notes what else a
-    buyer should know. See docs/fmu.md.
+    buyer should know. See docs/howto/fmu_export.md.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
