@@ -130,7 +130,7 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
 
 @pytest.mark.parametrize("place", ["plant", "drive", "sensor", "environment"])
 def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
-    lines = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "howto" / "diagnose.md").read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if line.startswith(f"| {place} | `"))
     own = [e.name for e in EFFECTS.values() if e.belongs_to == place]
     assert re.findall(r"`(\w+)`", row) == own
