@@ -19,7 +19,6 @@ TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 IN_TESTS = [
     "README.md",
     "docs/fmu.md",
-    "docs/howto/motor.md",
     "docs/howto/own_model.md",
     "docs/python.md",
 ]
@@ -87,7 +86,6 @@ def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert list(dict.fromkeys(marked)) == IN_TESTS
     files = (
         "any_model/test_any_model",
-        "any_model/test_motor",
         "cli/test_cli",
         "diagnosis/test_measured_rows",
     )
