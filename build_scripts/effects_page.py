@@ -1,25 +1,32 @@
 """Hook of mkdocs: the gallery of effects is made from the table of effects, and the playground."""
 
+import re
 import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 from mkdocs.structure.files import File, Files
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.remedy import example
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES
+from psa_casadi.model.ode_model import ode_model
 from psa_casadi.report.page.playground import playground
 from psa_casadi.report.plots.figures import save_signature, size_sentence
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size
 from psa_casadi.report.words.tables import Table, effect_parameter_table
+from psa_casadi.simulation.sizes import Sizes
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
 #: The page that runs every effect; its name with a sharp and an effect's begins with that one.
 PLAYGROUND = "playground.html"
+#: The heading of the page below which the effects of any model are.
+ANY_MODEL = "## Effects of any model"
 
 
 def on_files(files: Files, *, config: Any, **_: Any) -> Files:
@@ -35,8 +42,9 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """Return the text of a page, the one of effects with all of them below."""
     if page.file.src_uri != PAGE:
         return markdown
+    stack, heading, any_model = markdown.partition(ANY_MODEL)
     parts = [
-        markdown,
+        stack.rstrip(),
         f"In the [playground]({PLAYGROUND}) each effect has a switch and sliders, under any"
         " voltage ([how](howto/web.md)).",
         markdown_table(overview()),
@@ -44,7 +52,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     for place in dict.fromkeys(e.belongs_to for e in EFFECTS.values()):
         parts.append(f"## In the {place}")
         parts += [section(e) for e in EFFECTS.values() if e.belongs_to == place]
-    return "\n\n".join([*parts, "## Several modes", section(MODAL_SERIES[FEWEST])])
+    parts += ["## Several modes", section(MODAL_SERIES[FEWEST]), heading + any_model.rstrip()]
+    return "\n\n".join([*parts, markdown_table(of_any_model())])
 
 
 def overview() -> Table:
@@ -55,6 +64,27 @@ def overview() -> Table:
         for e in EFFECTS.values()
     )  # fmt: skip
     return Table(("effect", "in the", "what it looks like"), rows)
+
+
+def of_any_model() -> Table:
+    """Return one effect of each kind that a model's ports have: of a mass on a spring."""
+    x, v, u, k = (ca.SX.sym(n) for n in ("x", "v", "u", "k"))
+    ode = {"x": [x, v], "u": u, "p": k, "y": x, "ode": [v, u - k * x]}
+    model = ode_model(ode, name="any", outputs=["y"], values={"k": 1.0})
+    ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
+    each: dict[str, tuple[str, ...]] = {}
+    for effect in effects_of(model, Sizes(ones, ones, sample=1.0, duration=1.0)):
+        c = effect.component
+        fitted = [(p.name.removeprefix(f"{c.name}_"), p) for p in c.parameters if p.fitted]
+        law = re.sub(r"\|(\w+)\|", r"abs(\1)", c.equation_text)
+        row = (
+            f"`{c.name}`",
+            c.description.removeprefix(f"{effect.port.words}: "),
+            f"`{law}`",
+            "; ".join(f"`{name}` {p.description}" for name, p in fitted),
+        )
+        each.setdefault(re.split("_of_|_in_", effect.name)[0], row)
+    return Table(("effect", "what it is", "equation", "parameters"), tuple(each.values()))
 
 
 @cache

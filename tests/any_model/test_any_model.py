@@ -13,11 +13,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from build_scripts.measured_data import ROOT
+from build_scripts import effects_page
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
+from psa_casadi.examples import several_motors
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
@@ -249,7 +250,7 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
 ) -> None:
     """The program of the page, whose plant has its own equations."""
     monkeypatch.chdir(tmp_path)
-    first, intermediates, effect, posterior = blocks_in_tests("docs/howto/own_model.md")
+    first, intermediates, effect = blocks_in_tests("docs/howto/own_model.md")
     names: dict[str, Any] = {}
     _run(first, names)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["motor.html", "motor_with_friction.fmu"]
@@ -271,13 +272,14 @@ def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     assert {p.variable for p in ports_of(names["carts"]) if p.kind == "intermediate"} == {"spring"}
     _run(effect, names)
     assert [c.effect for c in names["worn_result"].causes] == ["brush_drop"]
-    _run(posterior, names)
-    for f in names["posterior"].figures:
+    several = several_motors.main(tmp_path)
+    assert isinstance(several["posterior"], psa.Posterior)
+    for f in several["posterior"].figures:
         true = {"k": 0.05, "J": 3e-5, "b": 2e-5}[f.name]
         assert abs(f.mean - true) < 4.0 * f.sd < 0.1 * true
-    output = Page((tmp_path / "two_motors.html").read_text("utf-8")).text
-    assert "Beyond noise, J differs (3 parameters compared)." in output
-    assert {(o.device, o.parameter) for o in names["motors"].outliers} == {("4", "J")}
+    text = Page((tmp_path / "two_motors.html").read_text("utf-8")).text
+    assert "Beyond noise, J differs (3 parameters compared)." in text
+    assert several["outliers"] == "J of 4"
     assert (tmp_path / "motors.html").stat().st_size > 10_000
 
 
@@ -362,7 +364,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
         name="any", outputs=["y"], values={"k": 1.0},
     )  # fmt: skip
     ones = dict.fromkeys(("x", "v", "u", "y"), 1.0)
-    text = (ROOT / "docs/howto/own_model.md").read_text("utf-8")
+    text = f"\n{effects_page.markdown_table(effects_page.of_any_model())}\n"
     items = []
     for effect in effects_of(model, Sizes(ones, ones, sample=1.0, duration=1.0)):
         kind, c = re.split("_of_|_in_", effect.name)[0], effect.component

@@ -1,26 +1,18 @@
-"""The pack of a motor on its page, asked about plants with other laws."""
+"""The example of a pack for a motor, asked about plants with other laws."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.special import iv
 
-import psa_casadi as psa
-from build_scripts.page_commands import block_in_tests
+from psa_casadi.examples import motor_pack
 
 
 @pytest.mark.slow
-def test_effects_of_a_pack_are_named_in_plants_of_other_forms(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The program of the page: each cause hidden once, and one record without any."""
-    monkeypatch.chdir(tmp_path)
-    (program,) = block_in_tests("docs/howto/motor.md").commands
-    names: dict[str, Any] = {}
-    exec("\n".join(program.split("\n")[1:-1]), names)
-    table: dict[str, psa.Diagnosis] = names["results"]
+def test_effects_of_a_pack_are_named_in_plants_of_other_forms(tmp_path: Path) -> None:
+    """The program of the example: each cause hidden once, and one record without any."""
+    table = motor_pack.main(tmp_path)
     clean = table.pop("nothing")
     assert clean.verdict == "adequate"
     assert not clean.causes

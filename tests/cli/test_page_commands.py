@@ -19,7 +19,6 @@ TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 IN_TESTS = [
     "README.md",
     "docs/howto/fmu_export.md",
-    "docs/howto/motor.md",
     "docs/howto/own_model.md",
     "docs/python.md",
 ]
@@ -87,7 +86,6 @@ def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert list(dict.fromkeys(marked)) == IN_TESTS
     files = (
         "any_model/test_any_model",
-        "any_model/test_motor",
         "cli/test_cli",
         "diagnosis/test_measured_rows",
     )
@@ -130,7 +128,7 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
 
 @pytest.mark.parametrize("place", ["plant", "drive", "sensor", "environment"])
 def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
-    lines = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "howto" / "diagnose.md").read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if line.startswith(f"| {place} | `"))
     items = [e.name for e in EFFECTS.values() if e.belongs_to == place]
     assert re.findall(r"`(\w+)`", row) == items

@@ -47,12 +47,15 @@ FIGURES: dict[str, list[tuple[float, float]]] = {
     ],
     "tracking_on_the_fmu": [(0.0, 1e-6), (40.0, 70.0), (0.0, 0.1)],
     "uncertainty_in_fmpy": [(24.0, np.inf), (20.0, np.inf), (1.0, 50.0), (0.5, 75.0)],
+    "loose_load": [(28.0, 30.0), (0.0, 0.01), (0.0, 0.1), (6.5, 8.0)],
 }  # fmt: skip
+#: Examples that `tests/any_model` runs.
+ELSEWHERE = ("motor_pack", "several_motors")
 
 
 @pytest.mark.parametrize(
     "name",
-    slow_but(["use_in_fmpy", "use_in_casadi"], EXAMPLES),
+    slow_but(["use_in_fmpy", "use_in_casadi"], [e for e in EXAMPLES if e not in ELSEWHERE]),
 )
 def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path.parent)
