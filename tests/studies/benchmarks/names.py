@@ -12,12 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
 import psa_casadi as psa
-from tests.studies.benchmarks.diagnose import draw_classes
-from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable, on_all_cores, styled
+from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable, on_all_cores
 from tests.studies.exam.marks import SURE, Answer, Question, Score, mark, score
 from tests.studies.golden.cases import ASKS, answered
 from tests.studies.second_exam import cases as second
@@ -109,7 +107,7 @@ def run(progress: Progress, quick: bool, only: str = "", seed: Sequence[int] = (
     if not jobs:
         raise psa.InputError(f"--only: no case has '{only}'; a case is one like {min(CASES)}.")
     result = on_all_cores(sat, jobs[:: -(-len(jobs) // QUICK)] if quick else jobs, progress)
-    return Outcome(tables(result), lambda: picture(result))
+    return Outcome(tables(result))
 
 
 def sat(case: str, draw: int) -> Sat:
@@ -234,21 +232,3 @@ def _class(item: Sequence[Stated]) -> dict[str, str]:
         "right": f"{right}/{len(item)}",
         "95 % band": f"{100 * band.low:.0f} to {100 * band.high:.0f} %",
     }
-
-
-def picture(found: Sequence[Sat]) -> Figure:
-    """Return the reliability diagram of names and families, with binomial 95 % bands."""
-    figure = Figure(figsize=(7.0, 5.5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot([0.0, 100.0], [0.0, 100.0], color="0.7", linewidth=0.8, label="right as stated")
-    for side, (level, every) in zip((-1, 1), stated(found).items(), strict=True):
-        draw_classes(
-            axes, [in_class(every, *ends) for ends in itertools.pairwise(BINS)], side, level
-        )
-    styled(
-        axes, "stated probability, mean of its class, %", "right, % (95 % band)",
-        "How often a stated name or family is right",
-    )  # fmt: skip
-    axes.set(xlim=(-6.0, 112.0), ylim=(-8.0, 108.0))
-    axes.legend(loc="upper left", fontsize=8)
-    return figure

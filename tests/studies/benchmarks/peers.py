@@ -78,14 +78,12 @@ _REACHED = 1.001
 
 
 def identify(progress: Progress, quick: bool) -> Outcome:
-    """Measure both on one record, then this package's fit on records of growing length.
+    """Measure both on one record.
 
     Both start at the same point near the truth (from farther away the peer stays in a side valley),
     search the same parameters with the same residuals, and stop when they will.
     """
-    length = 2000 if quick else 20_000
-    lengths = (1000, 10_000) if quick else (10_000, 100_000, 1_000_000)
-    return Outcome((_beside_scipy(length, progress), _growth(lengths, progress)))
+    return Outcome([_beside_scipy(2000 if quick else 20_000, progress)])
 
 
 def _record(samples: int) -> psa.Record:
@@ -104,8 +102,8 @@ def _record(samples: int) -> psa.Record:
 Trace = list[tuple[float, float]]
 
 
-def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
-    """Fit a record from the wrong values; return simulations, processor time [s] and trace."""
+def _fitted(record: psa.Record) -> tuple[int, Trace]:
+    """Fit a record from the wrong values; return simulations and trace."""
     model, began, trace = psa.stack_model(_STACK), time.process_time(), Trace()
     made: Any = fitting.Objective
 
@@ -124,13 +122,13 @@ def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
     with patch.object(fitting, "Objective", traced):
         sigma = [_NOISE * record.range_m]
         fit = fitting.fit(model, [whole(record)], FREE, sigma=sigma, start=start)
-    return fit.evaluations, time.process_time() - began, trace
+    return fit.evaluations, trace
 
 
 def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
     record = _record(samples)
     _fitted(record)  # compiles the model once, as on any first use
-    runs, _, ours = _fitted(record)
+    runs, ours = _fitted(record)
     progress(f"least_squares with solve_ivp on {samples} samples (minutes)")
     theirs = _scipy(record, _NOISE * record.range_m)
     ways = {"psa_casadi, fit": (runs, ours),
@@ -177,23 +175,6 @@ def _scipy(record: psa.Record, sigma: float) -> Trace:
     z0 = np.append(np.where(positive, np.log(ratio), ratio), 0.0)
     least_squares(residual, z0, method="lm", diff_step=np.full(z0.size, 1e-3), ftol=1e-5, xtol=1e-6)
     return trace
-
-
-def _growth(lengths: tuple[int, ...], progress: Progress) -> TitledTable:
-    rows = []
-    for samples in lengths:
-        progress(f"fit to {samples} samples")
-        runs, spent, _ = _fitted(_record(samples))
-        each = 1e6 * spent / runs / samples
-        rows.append({
-            "samples": samples, "CPU time [s]": f"{spent:.2f}", "simulations": runs,
-            "each, per sample [us]": f"{each:.1f}",
-        })  # fmt: skip
-    return TitledTable(
-        "The same fit over the length of the record",
-        rows,
-        "Every simulation carries the derivatives by all parameters; nothing was averaged.",
-    )
 
 
 #: Runs all sets of a work: displacements (sets, n) [m]; not finite where one cannot be integrated.

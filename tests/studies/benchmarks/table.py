@@ -13,9 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from psa_casadi.report.words.tables import Table
 
@@ -113,22 +111,3 @@ def bench(name: str, of: str = "run") -> Any:
     module, _, function = place.partition(":")
     result = import_module(f"tests.studies.benchmarks.{module}")
     return getattr(result, (function or of) if of == "run" else of, None)
-
-
-def styled(
-    axes: Axes, x: str = "", y: str = "", title: str = "", *, size: float = 10.5,
-    ticks: Iterable[float] = (),
-) -> None:  # fmt: skip
-    """Give axes labels and a title, a light grid below the curves, and small numbers.
-
-    Where there are `ticks`, a logarithmic axis below has these alone.
-    """
-    axes.set_xlabel(x, fontsize=size)
-    axes.set_ylabel(y, fontsize=size)
-    axes.set_title(title, loc="left", fontsize=size)
-    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    if places := sorted(ticks):
-        axes.set_xticks(places, [f"{v:g}" for v in places])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(labelsize=size - 2)
