@@ -237,7 +237,7 @@ def served(folder: Path) -> Iterator[tuple[str, str]]:
         running.wait(timeout=30)
 
 
-def asked(
+def request(
     place: str, method: str, path: str, body: bytes | None = None, **headers: str
 ) -> tuple[int, dict[str, str], bytes]:
     line = http.client.HTTPConnection(place, timeout=30)
@@ -254,11 +254,11 @@ def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: 
     with served(tmp_path) as (place, token):
         guess = f"psa_{place.partition(':')[2]}=guess"
         for path in ("/", "/state", "/report", "/?token=", "/?token=guess", "/files/report.html"):
-            assert asked(place, "GET", path)[0] == 403
-        assert asked(place, "POST", "/start")[0] == 403
-        assert asked(place, "GET", "/", Cookie=guess)[0] == 403
-        assert asked(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
-        status, headers, page = asked(place, "GET", f"/?token={token}")
+            assert request(place, "GET", path)[0] == 403
+        assert request(place, "POST", "/start")[0] == 403
+        assert request(place, "GET", "/", Cookie=guess)[0] == 403
+        assert request(place, "GET", f"/?token={token}", Host="psa.example")[0] in (400, 403, 421)
+        status, headers, page = request(place, "GET", f"/?token={token}")
         assert status == 200
         policy = headers["content-security-policy"]
         assert {"default-src 'none'", "frame-ancestors 'none'"} <= {*policy.split("; ")}
@@ -269,11 +269,13 @@ def test_the_page_that_diagnoses_answers_to_who_has_its_address_alone(tmp_path: 
         cookie, origin = headers["set-cookie"].split(";")[0], f"http://{place}"
         record = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k) for k in range(99))
         table = {"Cookie": cookie, "X_Name": quote("mine & <b>.csv")}
-        assert asked(place, "POST", "/files", record, Origin="http://x.example", **table)[0] == 403
-        assert asked(place, "POST", "/files", record, Origin=origin, **table)[0] < 300
+        assert (
+            request(place, "POST", "/files", record, Origin="http://x.example", **table)[0] == 403
+        )
+        assert request(place, "POST", "/files", record, Origin=origin, **table)[0] < 300
         started, state = time.monotonic(), {}
         while time.monotonic() < started + 30.0:
-            state = json.loads(asked(place, "GET", "/state", Cookie=cookie)[2])
+            state = json.loads(request(place, "GET", "/state", Cookie=cookie)[2])
             if "voltage" in json.dumps(state):
                 break
             time.sleep(0.1)

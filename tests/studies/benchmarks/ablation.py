@@ -94,7 +94,7 @@ def several_table(results: Mapping[str, Sequence[CaseResult]]) -> TitledTable:
 def ablation_table(
     title: str, methods: Mapping[str, Method], whole: Sequence[CaseResult], ask: Diagnosed
 ) -> TitledTable:
-    """Return what each method names in the cases beside the whole method."""
+    """Return the answers of each method to the cases, and how many differ from the whole method."""
     rows = [_row("the method", whole, whole)]
     for name, method in methods.items():
         rows.append(_row(name, ask([f.case for f in whole], method), whole))

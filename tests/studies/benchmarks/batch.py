@@ -33,8 +33,8 @@ DEFECTS: dict[str, Callable[[Stack], Stack]] = {
 def write_devices(folder: Path, count: int, defects: int, seed: int = 20) -> dict[str, str]:
     """Write a record for each device, and a table of jobs; return the defects by name, "" for none.
 
-    A sound device has its own force, hysteresis, asymmetry and bend. The voltage has loops that
-    shrink: every one turns at voltages of its own. The same seed gives the same bytes.
+    Sound devices differ in force, hysteresis, asymmetry and bend. The voltage has loops that
+    shrink, so that each turns at other voltages. The same seed gives the same bytes.
     """
     folder.mkdir()
     rng, usual = np.random.default_rng(seed), draw_stack(np.random.default_rng(7))

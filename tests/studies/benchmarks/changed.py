@@ -50,7 +50,7 @@ Answered = tuple[str, frozenset[str], frozenset[str]]
 
 
 def stability(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose everything as it is, then with white noise of 1 % of its own added."""
+    """Diagnose everything as it is, then with added white noise of 1 % of its noise."""
     jobs: list[tuple[str, Source, int]] = [
         (c.kind, c, 3 if quick else DRAWS) for c in chosen_cases(6 if quick else CASES)
     ]
@@ -71,7 +71,7 @@ def stability(progress: Progress, quick: bool) -> Outcome:
                 a[0] == b[0] and a[1] <= b[2] for a, b in pairs
             ),
         })  # fmt: skip
-    note = "Everything is diagnosed as it is, and with white noise of 1 % of its own added."
+    note = "Everything is diagnosed as it is, and with added white noise of 1 % of its noise."
     return Outcome([TitledTable("Data changed by 1 % of their noise", rows, note)])
 
 
@@ -80,8 +80,8 @@ def chosen_cases(count: int) -> list[Case]:
     every = study(KNOWN, FOREIGN, 2, FIRST)
     rows = [[c for c in every if c.kind == kind] for kind in _KINDS]
     each = -(-count // len(rows))
-    spread = [[item[len(item) * k // each] for k in range(each)] for item in rows]
-    return [item[k] for k in range(each) for item in spread][:count]
+    spread = [[of[len(of) * k // each] for k in range(each)] for of in rows]
+    return [of[k] for k in range(each) for of in spread][:count]
 
 
 def answer_of(source: Source, draw: int) -> Answered:
@@ -115,7 +115,7 @@ FIRST_ADDED, LENGTH, EXCERPTS = 620401, 2400, 2
 #: Rms of what is added and the base cannot absorb, over what the extended model of the record as it
 #: was measured leaves.
 SIZE = 3.0
-#: Samples in which the plant's voltage rises from zero to where an excerpt begins.
+#: Samples in which the plant's voltage rises from zero to the start of an excerpt.
 _LEAD = 400
 
 
@@ -157,8 +157,8 @@ def added(progress: Progress, quick: bool) -> Outcome:
     pieces = excerpts_from_reversals(1 if quick else EXCERPTS)[: 1 if quick else None]
     plain = on_all_cores(by_itself, [(p,) for p, _ in pieces], progress)
     jobs = [
-        (piece, others, effect, FIRST_ADDED + 100 * k + j, *item)
-        for k, ((piece, others), item) in enumerate(zip(pieces, plain, strict=True))
+        (piece, others, effect, FIRST_ADDED + 100 * k + j, *alone)
+        for k, ((piece, others), alone) in enumerate(zip(pieces, plain, strict=True))
         for j, effect in enumerate(effects)
     ]
     result = on_all_cores(with_effect, jobs, progress, lambda f: f"{f.record} with {f.effect}")
@@ -177,7 +177,7 @@ def added(progress: Progress, quick: bool) -> Outcome:
 def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Record, ...]]]:
     """Return excerpts of the measured records, each from a reversal on, and what else there is."""
     rng = np.random.default_rng(FIRST_ADDED)
-    items = []
+    pieces = []
     for record in datasets.micromanipulator():
         turns = [t for t in reversals(record.voltage) if t + LENGTH <= record.n]
         for start in np.sort(rng.choice(turns, each, replace=False)).tolist():
@@ -185,8 +185,8 @@ def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Recor
             parts = ((0, start), (start + LENGTH, record.n))
             others = tuple(record.slice(a, b) for a, b in parts if b - a >= _FEWEST)
             name = f"{record.name} from {record.time[start]:.1f} s"
-            items.append((replace(piece, name=name), others))
-    return items
+            pieces.append((replace(piece, name=name), others))
+    return pieces
 
 
 def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
@@ -215,19 +215,19 @@ def _pairs(quick: bool) -> list[tuple[str, psa.Record, psa.Record]]:
     """Return pairs of records of the same healthy device, of which the second is the reference."""
     sine, loops = datasets.micromanipulator()
     cuts = [sine.slice(k, k + 1500) for k in range(0, sine.n - 1500, 1500)]
-    items = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
-    items += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
+    pairs = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
+    pairs += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
     for record in RECORDS:
         if record.question.group == "clean":
             (whole,) = _records(record)[1]
             first, second = whole.slice(0, whole.n // 2), whole.slice(whole.n // 2, whole.n)
-            items.append((f"{record.name}, first half", first, second))
-            items.append((f"{record.name}, second half", second, first))
-    return items[::12] if quick else items
+            pairs.append((f"{record.name}, first half", first, second))
+            pairs.append((f"{record.name}, second half", second, first))
+    return pairs[::12] if quick else pairs
 
 
 def unchanged(name: str, new: psa.Record, reference: psa.Record) -> dict[str, object]:
-    """Diagnose a record against another one of the same device; a row of what is said."""
+    """Diagnose a record against another one of the same device; return a row of the answer."""
     try:
         d = psa.diagnose([new], reference=[reference])
     except psa.InputError:
@@ -259,9 +259,9 @@ def difference(record: psa.Record, effect: str, seed: int, size: float) -> Float
 _WAYS = ("without a reference", "other records", "the same test again")
 
 
-def summary(found: Sequence[Added]) -> TitledTable:
+def summary(cases: Sequence[Added]) -> TitledTable:
     """Return how often the effect is named, and how often one that is not there."""
-    new = [f for f in found if called(f.effect) not in f.before]
+    new = [f for f in cases if called(f.effect) not in f.before]
 
     def row(figure: str, target: str, holds: Callable[[Added, int], bool]) -> Row:
         shares = {way: share(holds(f, k) for f in new) for k, way in enumerate(_WAYS)}
@@ -287,7 +287,7 @@ def summary(found: Sequence[Added]) -> TitledTable:
             row("any cause that is not there", "-", lambda f, k: bool(wrong(f, k))),
             row("said to be as it was", "-", lambda f, k: f.answers[k].verdict == "adequate"),
         ],
-        f"{len(found) - len(new)} of {len(found)} effects are named in the record without them and"
+        f"{len(cases) - len(new)} of {len(cases)} effects are named in the record without them and"
         f" do not count. The added rms, beside what the base can absorb, is {SIZE:g} times the"
         f" residual of the record's extended model. Every {TUNED}rd case, on which the constants"
         " were chosen, is not counted.",

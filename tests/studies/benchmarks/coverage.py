@@ -4,7 +4,7 @@ Records come from the independent reference with white noise of 0.1 % of the lar
 loops at three amplitudes and two frequencies, a multisine. `identify` gets the records and the
 stiffness k_B, nothing else. What is compared is what voltage and displacement determine: forces
 over the stack's stiffness, lags, and masses over stiffnesses, each with the interval that the
-covariance of the fit gives it. Every stack has its own draws.
+covariance of the fit gives it. Every stack has other draws.
 """
 
 from collections.abc import Sequence
@@ -109,7 +109,7 @@ def compared(result: psa.Identification, truth: Values) -> tuple[Quantity, ...]:
 
 
 def quantities(p: Values, size: float) -> dict[str, float]:
-    """Return what voltage and displacement determine, by the parameter that it stands for.
+    """Return what voltage and displacement determine, by parameter.
 
     k, A, beta, gamma [m/V] and delta [m/(V.s)] as in eqs. (25), (26), beta and gamma at a
     hysteresis of `size` [m]; n; lags [s]; masses over stiffnesses [s^2].

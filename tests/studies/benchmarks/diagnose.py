@@ -46,7 +46,7 @@ def result_tables(results: Sequence[CaseResult]) -> list[TitledTable]:
 
 
 def _of(results: Sequence[CaseResult], *kinds: str) -> list[CaseResult]:
-    """Return the cases of kinds whose effect is as visible as was asked for."""
+    """Return the cases of kinds whose effect reached the visibility of its case."""
     return [f for f in results if f.case.kind in kinds and f.reached]
 
 
@@ -118,8 +118,8 @@ def _figures(results: Sequence[CaseResult]) -> TitledTable:
 def in_class(results: Sequence[CaseResult], low: float, high: float) -> list[tuple[float, bool]]:
     """Return the probabilities in (low, high] that an effect is the cause, and whether it is.
 
-    Every effect of every case counts in which one effect of the table is hidden, as visible as was
-    asked for, and a cause is named.
+    Every effect of every case counts in which one effect of the table is hidden, as visible as its
+    case demands, and a cause is named.
     """
     return [
         (p, effect == f.case.right)
@@ -152,7 +152,7 @@ Interval = tuple[float, float]
 class Covered(NamedTuple):
     """Reductions of the error [%] over further records, and the intervals that should hold them.
 
-    `blocks` is the interval from the diagnosed record's own blocks, for the reduction over all
+    `blocks` is the interval from the blocks of the diagnosed record, for the reduction over all
     further records; `experiments` are those from so many further records, `others` the reductions
     over the rest of them.
     """

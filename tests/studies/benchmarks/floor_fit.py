@@ -26,7 +26,7 @@ Columns = dict[str, FloatArray]
 #: Thresholds of the plays over half the voltage's range; relaxations in a decade of their time;
 #: voltages of the last samples that act directly.
 PLAYS, IN_A_DECADE, TAPS = 14, 2, 4
-#: Powers of the plays, each with a prior of its own.
+#: Powers of the plays, each with a separate prior.
 _POWERS = (1, 2, 3)
 
 
@@ -65,10 +65,10 @@ def memory(v: FloatArray, before: Sequence[float]) -> Columns:
     """
     thresholds = np.arange(1, PLAYS + 1) / (PLAYS + 1.0)
     plays = np.column_stack([play(v, float(r), before) for r in thresholds])
-    items = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
+    late = [np.r_[np.full(k, v[0]), v[: len(v) - k]] for k in range(1, TAPS + 1)]
     curve = {"voltage": np.column_stack([v, v**2, v**3])}
     powers = {f"plays^{p}": plays**p for p in (1, 2, 3)}
-    return {**curve, **powers, "taps": np.column_stack(items)}
+    return {**curve, **powers, "taps": np.column_stack(late)}
 
 
 def relaxations(v: FloatArray, driving: FloatArray, longest: float) -> Columns:
@@ -96,7 +96,7 @@ def ringing(n: int, mode: Mode) -> FloatArray:
 
 
 def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) -> FloatArray:
-    """Return hats over the displacement: what is fixed to a place, up and down alike."""
+    """Return hats over the displacement: a function of the place, the same up and down."""
     at = np.clip((displacement - low) / (high - low), 0.0, 1.0) * (knots - 1)
     return np.asarray(np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(knots))))
 
@@ -110,7 +110,7 @@ def _lagging(v: FloatArray, time: float) -> FloatArray:
 
 
 #: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
-#: slower and less damped ones imitate loops of the voltage's own frequency.
+#: slower and less damped ones imitate loops at the frequency of the voltage.
 _FREQUENCIES, _DAMPINGS = np.linspace(0.02, 0.495, 96), (0.005, 0.02, 0.08)
 _SLOWEST, _FASTEST, _LEAST, _MOST = 0.02, 0.4999, 4e-3, 0.7
 #: A line is so many times larger than the median of so many neighbours in the spectrum; of noise
@@ -121,8 +121,8 @@ _REGULAR, _STEPS = 1e-9, 60
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
-    """What features (samples, count) leave of an output and of further columns."""
+class Projection:
+    """The projection of an output on features (samples, count), and its rest."""
 
     features: FloatArray
     left: FloatArray
@@ -130,18 +130,18 @@ class Beside:
 
     def gain(self, columns: FloatArray) -> float:
         """Return by how much more columns lessen the sum of squares that is left."""
-        item = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
-        gram = item.T @ item + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
-        cross = item.T @ self.left
+        rest = columns - self.features @ cho_solve(self.factor, self.features.T @ columns)
+        gram = rest.T @ rest + _REGULAR * np.eye(columns.shape[1]) * float(np.sum(columns**2))
+        cross = rest.T @ self.left
         return float(cross @ np.linalg.solve(gram, cross))
 
 
-def beside(features: FloatArray, output: FloatArray) -> Beside:
-    """Return what is left of an output beside features."""
+def project(features: FloatArray, output: FloatArray) -> Projection:
+    """Return the rest of an output after a projection on features."""
     gram = features.T @ features
     gram += np.diag(_REGULAR * np.diag(gram) + np.finfo(float).tiny)
     factor = cho_factor(gram, lower=True)
-    return Beside(features, output - features @ cho_solve(factor, features.T @ output), factor)
+    return Projection(features, output - features @ cho_solve(factor, features.T @ output), factor)
 
 
 class Search:
@@ -154,13 +154,13 @@ class Search:
             for mode in (Mode(float(f), d) for f in _FREQUENCIES for d in _DAMPINGS)
         ]
 
-    def next(self, others: Beside) -> Mode:
+    def next(self, others: Projection) -> Mode:
         """Return the mode or the line that explains most of what is left, refined."""
         mode = max(self._grid, key=lambda pair: others.gain(pair[1]))[0]
-        items = [self.tuned(m, others) for m in (mode, *self._line(others))]
-        return max(items, key=lambda m: others.gain(self._answer(m)))
+        tuned = [self.tuned(m, others) for m in (mode, *self._line(others))]
+        return max(tuned, key=lambda m: others.gain(self._answer(m)))
 
-    def tuned(self, mode: Mode, others: Beside) -> Mode:
+    def tuned(self, mode: Mode, others: Projection) -> Mode:
         """Return a mode with the frequency, and the damping unless it is 0, that explain most."""
         line = mode.damping == 0.0
         step = 0.3 / len(self._used) if line else 0.002
@@ -180,8 +180,8 @@ class Search:
         result: Any = minimize(loss, begin, method="Nelder-Mead", options=options)
         return made(result.x)
 
-    def _line(self, others: Beside) -> list[Mode]:
-        """Return the largest line that stands out of the spectrum of what is left, if one does."""
+    def _line(self, others: Projection) -> list[Mode]:
+        """Return the largest line in the spectrum of the rest, if one exceeds its neighbours."""
         left = np.zeros(len(self._used))
         left[self._used] = others.left
         size = np.abs(np.fft.rfft(left))
@@ -212,7 +212,7 @@ class Ridge:
 
 
 def ridge(features: FloatArray, kinds: IntArray, y: FloatArray) -> Ridge:
-    """Fit y = features @ weights; kind 0 has no prior, every other one a size found by evidence.
+    """Fit y = features @ weights; kind 0 has no prior, evidence sizes that of all others.
 
     MacKay's re-estimation: each size from the weights and how well the data determine them.
     """
@@ -261,8 +261,8 @@ History = tuple[float, ...]
 HISTORIES: tuple[History, ...] = ((), (1.0,), (-1.0,), (1.0, -1.0), (-1.0, 1.0))
 #: Most modes; the log evidence that one has to add, the price of its frequency and damping.
 _MODES, _WORTH = 14, 25.0
-#: The play that relaxations follow beside the voltage; knots that a curve over the displacement may
-#: have (0: no curve), and its rounds.
+#: The play that relaxations follow, as they do the voltage; numbers of knots of a curve over the
+#: displacement (0: no curve), and its rounds.
 _FOLLOWED, _KNOTS, _ROUNDS = 0.3, (0, 6, 10, 20, 40, 80), 3
 
 
@@ -287,9 +287,9 @@ class Floor(NamedTuple):
 class _Fitted(NamedTuple):
     """A fit: features (samples, count) of all parts, the displacement, the curve's columns."""
 
-    found: Ridge
+    ridge: Ridge
     features: FloatArray
-    shown: FloatArray
+    predicted: FloatArray
     curves: Sequence[Columns]
 
 
@@ -329,22 +329,22 @@ class _Problem:
     def with_curve(self, columns: Sequence[Columns], knots: int) -> _Fitted:
         """Fit with a curve over what the other columns say that the displacement is."""
         fitted = self.fitted(columns)
-        under = fitted.shown
+        under = fitted.predicted
         for _ in range(_ROUNDS if knots else 0):
             low, high = float(under.min()), float(under.max())
             hats = [fine_curve(y, low, high, knots) for y in self.split(under)]
             fitted = self.fitted(columns, [{"fine curve": h} for h in hats])
-            under = fitted.shown - np.vstack(hats) @ fitted.found.weights[-knots:]
+            under = fitted.predicted - np.vstack(hats) @ fitted.ridge.weights[-knots:]
         return fitted
 
     def best_curve(self, columns: Sequence[Columns]) -> tuple[_Fitted, int]:
         """Return the fit with the knots of most evidence, and their number."""
         tried = [(self.with_curve(columns, knots), knots) for knots in _KNOTS]
-        return max(tried, key=lambda pair: pair[0].found.evidence)
+        return max(tried, key=lambda pair: pair[0].ridge.evidence)
 
-    def split(self, shown: FloatArray) -> list[FloatArray]:
+    def split(self, whole: FloatArray) -> list[FloatArray]:
         """Return an array of all samples as one for each part."""
-        return np.split(shown, np.cumsum([len(v) for v in self.voltages])[:-1])
+        return np.split(whole, np.cumsum([len(v) for v in self.voltages])[:-1])
 
 
 def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: None) -> Floor:
@@ -356,7 +356,7 @@ def floor_of(parts: Sequence[Part], progress: Callable[[str], None] = lambda _: 
     modes = _modes(problem, histories, fitted, progress)
     progress("fine curve")
     fitted, knots = problem.best_curve(problem.columns(histories, modes))
-    return Floor(tuple(problem.split(fitted.shown)), modes, histories, knots)
+    return Floor(tuple(problem.split(fitted.predicted)), modes, histories, knots)
 
 
 def stacked(
@@ -364,7 +364,7 @@ def stacked(
 ) -> tuple[FloatArray, IntArray]:
     """Return the features of all parts, and the kind of each; the first columns have kind 0.
 
-    What is left of a start belongs to its own record alone.
+    The transient of a start belongs to one record.
     """
     every = [c | m for c, m in zip(columns, curves or [{}] * len(columns), strict=True)]
     blocks = [
@@ -380,7 +380,7 @@ def _histories(problem: _Problem) -> tuple[History, ...]:
     chosen: list[History] = [()] * len(problem.voltages)
     for k in range(len(chosen)):
         tried = [[*chosen[:k], h, *chosen[k + 1 :]] for h in HISTORIES]
-        chosen = max(tried, key=lambda h: problem.fitted(problem.columns(h, ())).found.evidence)
+        chosen = max(tried, key=lambda h: problem.fitted(problem.columns(h, ())).ridge.evidence)
     return tuple(chosen)
 
 
@@ -390,18 +390,18 @@ def _modes(
     fitted: _Fitted,
     progress: Callable[[str], None],
 ) -> tuple[Mode, ...]:
-    """Return modes and lines found one by one, all tuned again, while the evidence grows."""
+    """Add modes and lines one by one, and tune all again, while the evidence grows."""
     used, y, curves = problem.used, problem.y[problem.used], fitted.curves
     search = Search(problem.voltages, used)
     modes: list[Mode] = []
     while len(modes) < _MODES:
         progress(f"mode {len(modes) + 1}")
-        tried = [*modes, search.next(beside(fitted.features[used], y))]
+        tried = [*modes, search.next(project(fitted.features[used], y))]
         for k, mode in enumerate(tried[:-1]):
             without = problem.columns(histories, [*tried[:k], *tried[k + 1 :]])
-            tried[k] = search.tuned(mode, beside(stacked(without, curves)[0][used], y))
+            tried[k] = search.tuned(mode, project(stacked(without, curves)[0][used], y))
         wider = problem.fitted(problem.columns(histories, tried), curves)
-        if wider.found.evidence < fitted.found.evidence + _WORTH:
+        if wider.ridge.evidence < fitted.ridge.evidence + _WORTH:
             break
         modes, fitted = tried, wider
     return tuple(modes)

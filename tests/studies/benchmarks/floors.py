@@ -1,4 +1,4 @@
-"""The benchmark `floors`: a diagnosis of measured records beside the floor of each of them.
+"""The benchmark `floors`: held-out errors of diagnoses of measured records, and the floor of each.
 
 The floor is the held-out error of many features fitted together, none of them with a physical
 meaning: what a model of the plant's kind could reach at best on the same samples.
@@ -34,11 +34,11 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
     rows, ratios = [], []
     for name, records in cases:
 
-        def tell(step: str, name: str = name) -> None:
+        def report(step: str, name: str = name) -> None:
             progress(f"{name}: {step}")
 
-        d = psa.diagnose(records, progress=tell)
-        errors = (d.base_errors, d.extended_errors, floor_on(d.experiments, tell))
+        d = psa.diagnose(records, progress=report)
+        errors = (d.base_errors, d.extended_errors, floor_on(d.experiments, report))
         base, extended, floor = (e.holdout_nrmse_percent for e in errors)
         ratios.append(extended / floor)
         rows.append({

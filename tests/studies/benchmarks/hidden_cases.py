@@ -30,7 +30,7 @@ Kind = Literal[
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
-#: A hidden effect counts from this share of the smallest rho that was asked for.
+#: A hidden effect counts from this share of the smallest rho of its case.
 REACHED = 0.9
 #: Classes of voltages that show less than a rich one.
 POOR: tuple[PoorKind, ...] = ("sine", "triangle", "steps", "slow", "loops")
@@ -97,7 +97,7 @@ class CaseResult:
 
     @property
     def reached(self) -> bool:
-        """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
+        """Whether the visibility of the case is reached; true where nothing is hidden."""
         return self.case.effect is None or self.rho >= REACHED * self.case.rho[0]
 
     @property
@@ -123,7 +123,7 @@ class CaseResult:
 
 
 def how_made(case: Case) -> dict[str, Any]:
-    """Return what `make_record` is told of a case beside effect and seed."""
+    """Return the arguments of `make_record` for a case, but for effect and seed."""
     return {
         "noise": case.noise, "excitation": case.excitation, "more": case.more,
         "visible": case.rho if case.effect else None,
@@ -171,7 +171,7 @@ def diagnosed(
 
 
 def names_of(d: psa.StackDiagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the named causes, and these with what they cannot be told from."""
+    """Return the named causes, and these with what cannot be distinguished from them."""
     named = tuple(c.effect for c in d.causes)
     similar = (n for c in d.causes for n in c.cannot_be_told_from)
     return named, tuple(dict.fromkeys((*named, *similar)))

@@ -2,8 +2,8 @@
 
 The public records are not in the project: `--folder` holds the files of EMPS (Janot, Gautier and
 Brunot 2019), Silverbox (Wigren and Schoukens 2013) and F-16 (Noel and Schoukens 2017), as
-nonlinearbenchmark.org gives them; what is not there is said.
-Each model is the plain one that an engineer begins with.
+nonlinearbenchmark.org gives them; missing files are listed.
+Each model is the plain one from which an engineer starts.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,7 +30,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         ("pendulum under a controller", hard.pendulum, ""),
         ("the same, hidden drag", lambda: hard.pendulum(drag=0.05), "drag_in_w"),
         ("chaos in two wells", hard.duffing, ""),
-        ("chaos, a state is not shown", hard.lorenz, ""),
+        ("chaos, a state without output", hard.lorenz, ""),
         ("slide, dry friction and slope", hard.slide, "friction_in_v, constant_in_v"),
         ("spring that softens", lambda: (hard.spring(), hard.aged(0), {}), "change_of_k_with_time"),
         ("battery, resistance over charge", lambda: (*hard.battery(), {}), "change_of_R0_with_soc"),
@@ -46,8 +46,8 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         )
     ]  # fmt: skip
     if folder is not None and not quick:
-        items = [_public(progress, folder, *case) for case in PUBLIC]
-        tables.append(TitledTable("Public benchmarks", items, "Test: rms of simulated records."))
+        public = [_public(progress, folder, *case) for case in PUBLIC]
+        tables.append(TitledTable("Public benchmarks", public, "Test: rms of simulated records."))
     return Outcome(tables)
 
 

@@ -59,9 +59,9 @@ _FRAMES: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 _ACT = """<script>
 document.querySelectorAll('h1, nav, h2, .live ~ *').forEach(function (n) {{ n.hidden = true; }});
 var box = document.querySelector('.live');
-var told = JSON.parse(box.querySelector('script').textContent);
+var data = JSON.parse(box.querySelector('script').textContent);
 function start(name) {{
-  return told.parameters.find(function (p) {{ return p.name === name; }}).value;
+  return data.parameters.find(function (p) {{ return p.name === name; }}).value;
 }}
 (function begin() {{
   if (!box.psa) {{ setTimeout(begin, 20); return; }}

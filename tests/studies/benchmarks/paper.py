@@ -1,4 +1,4 @@
-"""The paper's identification beside the prediction-error fit, against noise and window.
+"""The paper's identification against the prediction-error fit, against noise and window.
 
 The records are steps of the independent reference. As the paper assumes, nothing but eq. (13) is in
 them: no hysteresis, and a drive a thousand times faster than the stack. White noise is added as a

@@ -19,9 +19,9 @@ from psa_casadi.report.words.tables import Table
 
 T = TypeVar("T")
 FloatArray = npt.NDArray[np.float64]
-#: Tells a step of long work.
+#: Reports a step of long work.
 Progress = Callable[[str], None]
-#: One row of a table: what stands in each column, by the column's head.
+#: One row of a table: the cell of each column, by the column's head.
 Row = Mapping[str, object]
 
 
@@ -61,7 +61,7 @@ def on_all_cores(
 ) -> list[T]:
     """Return function(*job) of every job, in their order, worked on side by side.
 
-    `report` says in words what one has given.
+    `report` returns a line about one result.
     """
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         futures = [pool.submit(function, *job) for job in jobs]

@@ -182,7 +182,7 @@ def temperature(run: Run) -> Floats:
 
 
 def displacement(strain: Floats, run: Run) -> Floats:
-    """Return the displacement [um] of a stack whose free strain is given [V]."""
+    """Return the displacement [um] of a stack from its free strain [V]."""
     moved = _vibrating(strain, run)
     modes = run.record.hidden.get("mode", ())
     if modes:
@@ -381,7 +381,7 @@ def _interference(y: Floats, run: Run, values: Values) -> Floats:
 
 
 def _second_device(y: Floats, run: Run, values: Values) -> Floats:
-    """Another actuator that moves the stack: size, frequency [Hz] of its own triangle."""
+    """Another actuator that moves the stack: size, frequency [Hz] of its triangle."""
     size, frequency = values
     slow = 1 + 0.3 * np.sin(2 * math.pi * frequency * 0.37 * run.times)
     return y + size * run.record.stack.stroke * triangle(frequency * run.times + 0.13) * slow

@@ -14,7 +14,7 @@ import numpy as np
 import psa_casadi as psa
 from tests.any_model.own_models import motor
 
-#: What differs between two exports of one model, or between versions, and says nothing of it.
+#: What differs between two exports of one model, or between versions, and does not matter.
 _UNSTABLE = (
     re.compile(r"/\*.*?\*/", re.S),
     re.compile(r"\{?[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}\}?"),

@@ -76,6 +76,6 @@ def play_again(
     for effect, parameters, _ in effects:
         if effect.room is not None:
             temperature = effect.room(times, parameters)
-    read, _ = disturb(rng, truth.noise, clean)
+    read = disturb(rng, truth.noise, clean)
     write_csv(path, times, command, read, temperature)
     return clean

@@ -19,8 +19,8 @@ RATIO = (1.5, 4.0)
 SEARCH = 12
 """Sub-intervals while a gain is searched; the record itself has the full number."""
 WEAK = 0.02
-"""Where a ratio is asked for, gains go down to this share of the smallest that is plausible: that
-one is worth noticing, a weaker one is no less possible.
+"""If a ratio is demanded, gains go down to this share of the smallest that is plausible: a weaker
+one is possible too.
 """
 
 ATTEMPTS, ENOUGH = 4, 1.25

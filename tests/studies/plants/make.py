@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
@@ -23,18 +22,16 @@ THERMOMETER = ",temperature [degC]"
 class Truth:
     """What is behind a record.
 
-    effect: the hidden effect or None; foreign: True where the project's table has no such effect.
-    gain and parameters: the effect's own, SI. stack: the base. sigma, quantum: rms of the noise and
-    count of the sensor [m]. visible: rms of what the base cannot absorb over sigma. gain_limited:
-    the gain wanted was beyond the effect's plausible range and was clipped. times, voltage,
-    displacement, base_displacement: (N,) clean [s, V, m], the last without any effect. noise: kind
-    and figures of the noise; lost: (N,) True where a sample is missing or stuck. excitation: class
-    of the voltage. temperature: (N,) [degC] where the record has a thermometer. more: further
-    hidden effects, added to the first.
+    effect: the hidden effect or None. gain and parameters: the effect's own, SI. stack: the base.
+    sigma, quantum: rms of the noise and count of the sensor [m]. visible: rms of what the base
+    cannot absorb over sigma. gain_limited: the gain wanted was beyond the effect's plausible range
+    and was clipped. times, voltage, displacement, base_displacement: (N,) clean [s, V, m], the last
+    without any effect. noise: kind and figures of the noise. excitation: class of the voltage.
+    temperature: (N,) [degC] where the record has a thermometer. more: further hidden effects, added
+    to the first.
     """
 
     effect: str | None
-    foreign: bool
     gain: float
     parameters: Mapping[str, float]
     stack: Stack
@@ -47,7 +44,6 @@ class Truth:
     displacement: FloatArray
     base_displacement: FloatArray
     noise: Noise
-    lost: npt.NDArray[np.bool_]
     excitation: ExcitationKind
     temperature: FloatArray | None
     more: tuple[Hidden, ...]
@@ -103,19 +99,17 @@ def make_record(
     )
     every = [(h.effect, h.parameters, h.gain) for h in (*first, *others)]
     clean = run.displacement + added_by(run, every)
-    read, lost = disturb(noise_rng, kind, clean)
+    read = disturb(noise_rng, kind, clean)
     temperature = None
     for one, parameters, _ in every:
         if one.room is not None:
             temperature = one.room(run.times, parameters)
     write_csv(path, run.times, run.command, read, temperature)
-    displayed = (first[0].gain, first[0].parameters) if first else (0.0, {})
+    gain_and_parameters = (first[0].gain, first[0].parameters) if first else (0.0, {})
     visibility = (first[0].visible, first[0].gain_limited) if first else (0.0, False)
-    foreign = chosen is not None and chosen.foreign
     return Truth(
         effect,
-        foreign,
-        *displayed,
+        *gain_and_parameters,
         stack,
         kind.rms,
         kind.quantum,
@@ -125,7 +119,6 @@ def make_record(
         clean,
         run.displacement,
         kind,
-        lost,
         excitation,
         temperature,
         others,

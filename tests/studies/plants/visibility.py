@@ -49,14 +49,10 @@ def base_columns(
     return np.column_stack([*columns, *(derivative(name) for name in FREE)])
 
 
-def left_over(directions: FloatArray, contribution: FloatArray) -> FloatArray:
-    """What is left of the contribution beside the directions, (N,) [m]."""
-    return contribution - directions @ (directions.T @ contribution)
-
-
 def visible_ratio(directions: FloatArray, contribution: FloatArray, sigma: float) -> float:
     """Rms of what is left over the noise's sigma [1]."""
-    return math.sqrt(float(np.mean(left_over(directions, contribution) ** 2))) / sigma
+    left = contribution - directions @ (directions.T @ contribution)
+    return math.sqrt(float(np.mean(left**2))) / sigma
 
 
 def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
