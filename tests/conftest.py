@@ -21,7 +21,7 @@ from build_scripts.measured_data import measured_data_directory, must_be_present
 from tests.check_here import rows_here
 
 #: Groups of tests that share something long, the longest first.
-LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
+LONG_GROUPS = ("platforms", "identification", "demo", "search", "browser")
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -161,12 +161,12 @@ def _third_party() -> frozenset[tuple[Path, str, bool]]:
 
     Each package here is imported under the name that it is installed by, in lower case.
     """
-    item = {*sys.stdlib_module_names, "psa_casadi"}
+    ours = {*sys.stdlib_module_names, "psa_casadi"}
     return frozenset(
         (path, name, inside)
         for path, tree in _trees().items()
         for name, inside in _imports(tree)
-        if name not in item
+        if name not in ours
     )
 
 
@@ -197,8 +197,8 @@ def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
 
 
 def test_the_developers_install_has_every_extra() -> None:
-    (item,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
-    assert item.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
+    (whole,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
+    assert whole.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
 
 
 def test_the_workflow_runs_every_python_that_is_promised() -> None:

@@ -178,10 +178,10 @@ def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
 
 def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    for text, statement in (("{}", "no diagnosis"), ("[", "x.json"), (
+    for text, message in (("{}", "no diagnosis"), ("[", "x.json"), (
         '{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing")):  # fmt: skip
         path.write_text(text, encoding="utf-8")
-        with pytest.raises(psa.InputError, match=statement):
+        with pytest.raises(psa.InputError, match=message):
             psa.load_diagnosis(path)
     with pytest.raises(psa.InputError, match=r"none\.json"):
         psa.load_diagnosis(tmp_path / "none.json")
@@ -376,8 +376,8 @@ def test_another_process_predicts_the_same(tmp_path: Path) -> None:
         "models = pickle.load(open(sys.argv[1], 'rb'));"
         "np.savez(sys.argv[2], *[driven(m)[0] for m in models])"
     )
-    items = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
-    subprocess.run([sys.executable, "-c", code, *items], check=True)
+    paths = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
+    subprocess.run([sys.executable, "-c", code, *paths], check=True)
     with np.load(tmp_path / "y.npz") as result:
         for model, y in zip(models, result.values(), strict=True):
             np.testing.assert_array_equal(y, driven(model)[0])

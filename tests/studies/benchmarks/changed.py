@@ -28,10 +28,9 @@ from tests.studies.exam.play import write
 from tests.studies.exam.record import Record as ExamRecord
 from tests.studies.exam.records import RECORDS
 from tests.studies.plants.base import simulate_base
-from tests.studies.plants.hide import hide
+from tests.studies.plants.hide import base_directions, hide
 from tests.studies.plants.stack import draw_stack
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
-from tests.studies.plants.visibility import base_directions
 
 #: The first of the seeds of `stability`, which no other benchmark uses; the change of the data over
 #: the rms of their noise; that of the measured records [m].
@@ -249,9 +248,7 @@ def difference(record: psa.Record, effect: str, seed: int, size: float) -> Float
     times: FloatArray = record.sample_time * np.arange(played.size, dtype=np.float64)
     run = simulate_base(stack, times, played)
     scale = record.range_m / float(np.ptp(run.displacement[_LEAD:]))
-    hidden = hide(
-        HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, 1.0, visible=1.0
-    )
+    hidden = hide(HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, visible=1.0)
     return np.asarray(scale * hidden.added[_LEAD:], dtype=np.float64)
 
 

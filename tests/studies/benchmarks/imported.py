@@ -20,7 +20,6 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import psa_casadi as psa
-from psa_casadi.export.importer.played import RUNS
 from psa_casadi.units import FloatArray
 from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
 from tests.export.test_fmu_played import with_effects
@@ -149,9 +148,8 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         if not quick:
             hidden.append(_diagnosed(case, path, progress))
     note = (
-        "Off: distance from the truth in standard errors. Runs: simulations of whole records"
-        " by the FMU, where it is run as a whole. Cost: half the sum of squares over the noise,"
-        " ours over the peer's."
+        "Off: distance from the truth in standard errors. Cost: half the sum of squares over the"
+        " noise, ours over the peer's."
     )
     tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", result, note)]
     if hidden:
@@ -181,7 +179,7 @@ def _held() -> list[Row]:
     return rows
 
 
-_HEADS = ("off", "runs", "runs of the peer", "cost", "s")
+_HEADS = ("off", "cost")
 
 
 def _input(case: Case) -> tuple[FloatArray, FloatArray]:
@@ -217,22 +215,15 @@ def _plain(name: str) -> str:
 def _identified(case: Case, path: Path) -> Row:
     model = psa.fmu_model(path, free=case.free, values=dict(case.values))
     record = record_of(case)
-    RUNS.forget()
-    samples, begin = RUNS.samples, perf_counter()
     result = psa.identify(model, record, known_start=True)
-    took, runs = perf_counter() - begin, (RUNS.samples - samples) / _SAMPLES
     names = [_plain(n) for n in case.true]
     off = max(
         abs(result.model.values[n] - v) / result.errors[n]
         for n, v in zip(names, case.true.values(), strict=True)
     )
     ours = 0.5 * float(np.sum(_residuals(result.model, case, record) ** 2))
-    peer, calls = _peer(model, case, record)
-    return {
-        "fmu": case.name, "off": f"{off:.1f}",
-        "runs": f"{runs:.0f}" if model.structure.played else "-", "runs of the peer": calls,
-        "cost": f"{ours / peer:.5f}", "s": f"{took:.1f}",
-    }  # fmt: skip
+    peer = _peer(model, case, record)
+    return {"fmu": case.name, "off": f"{off:.1f}", "cost": f"{ours / peer:.5f}"}
 
 
 def _residuals(model: psa.Model, case: Case, record: Mapping[str, FloatArray]) -> FloatArray:
@@ -244,15 +235,11 @@ def _residuals(model: psa.Model, case: Case, record: Mapping[str, FloatArray]) -
     return np.concatenate([(y[n] - record[n]) / (_NOISE * np.std(record[n])) for n in outputs])
 
 
-def _peer(
-    model: psa.Model, case: Case, record: Mapping[str, FloatArray]
-) -> tuple[float, int]:  # fmt: skip
-    """Return the cost that SciPy finds from a model's values, and its simulations."""
-    names, calls = [_plain(n) for n in case.true], 0
+def _peer(model: psa.Model, case: Case, record: Mapping[str, FloatArray]) -> float:
+    """Return the cost that SciPy reaches from a model's values."""
+    names = [_plain(n) for n in case.true]
 
     def residuals(values: FloatArray) -> FloatArray:
-        nonlocal calls
-        calls += 1
         return _residuals(
             model.with_values(dict(zip(names, values.tolist(), strict=True))), case, record
         )
@@ -263,7 +250,7 @@ def _peer(
         residuals, starts, bounds=(low, high), x_scale=np.abs(starts),
         diff_step=[1e-3] * len(starts),
     )  # fmt: skip
-    return float(result.cost), calls
+    return float(result.cost)
 
 
 def _diagnosed(case: Case, path: Path, progress: Progress) -> Row:
@@ -276,8 +263,7 @@ def _diagnosed(case: Case, path: Path, progress: Progress) -> Row:
             case, lag=case.lag if hidden == "lag" else 0.0, gain=0.85 if hidden == "gain" else 1.0
         )
         model = psa.fmu_model(path, free=narrow, values={**case.values, **kept})
-        begin = perf_counter()
         d = psa.diagnose(model, record, known_start=True)
         causes = ", ".join(f"{c.effect} {c.confidence:.2f}" for c in d.causes)
-        row |= {hidden: causes or d.verdict, f"{hidden}, s": f"{perf_counter() - begin:.0f}"}
+        row[hidden] = causes or d.verdict
     return row

@@ -19,8 +19,7 @@ import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.records import multisine, sine, time_grid
 from psa_casadi.units import FloatArray
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.make import Truth, make_record, play_again
 
 Values = Mapping[str, float]
 

@@ -36,11 +36,10 @@ SEED, ACCEPT = 3, 0.9
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Draws (n, size) of theta, gradients evaluated for them, processor time [s] with tuning."""
+    """Draws (n, size) of theta, and their processor time [s] with tuning."""
 
     way: str
     theta: FloatArray
-    gradients: float
     seconds: float
 
     @property
@@ -84,25 +83,13 @@ def record() -> psa.Record:
 
 
 def drawn_by_psa(task: Task, draws: int, tune: int) -> Drawn:
-    """Return draws by the sampler and the gradients of `psa.sample`, in one chain."""
-    counted = _Counted(task)
+    """Return draws by the sampler of `psa.sample`, in one chain."""
     began = time.process_time()
     with one_thread():
-        chains = chains_of(counted, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
+        chains = chains_of(task.density, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
     spent = time.process_time() - began
     theta = np.array([task.density.theta(u) for u in chains.u[0]])
-    return Drawn("psa.sample", theta, counted.count, spent)
-
-
-class _Counted:
-    """A density that counts how often it is evaluated."""
-
-    def __init__(self, task: Task) -> None:
-        self.density, self.size, self.count = task.density, task.density.size, 0
-
-    def __call__(self, u: FloatArray, /) -> tuple[float, FloatArray]:
-        self.count += 1
-        return self.density(u)
+    return Drawn("psa.sample", theta, spent)
 
 
 def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
@@ -117,13 +104,11 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
         began = time.process_time()
         result = pm.sample(
             draws=draws, tune=tune, chains=1, cores=1, step=step, random_seed=SEED,
-            progressbar=False, compute_convergence_checks=False, discard_tuned_samples=False,
+            progressbar=False, compute_convergence_checks=False,
         )  # fmt: skip
         spent = time.process_time() - began
     moved = result.posterior["u"].to_numpy()[0]
-    groups = (result.sample_stats, result.warmup_sample_stats)
-    steps = sum(float(g["n_steps"].sum()) for g in groups)
-    return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, steps, spent)
+    return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, spent)
 
 
 def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
@@ -183,14 +168,12 @@ def hysteresis_rate(force: Any, t: Any, p: Any, values: Any, pt: Any) -> Any:
 
 
 def speed(drawn: list[Drawn]) -> TitledTable:
-    """Return gradients, effective samples and processor time of each way, and their ratio."""
+    """Return effective samples and processor time of each way, and their ratio."""
     sizes = [f.effective for f in drawn]
     each = [size / f.seconds for size, f in zip(sizes, drawn, strict=True)]
     rows = [
-        {"way": f.way, "draws": len(f.theta), "gradients": f"{f.gradients:.0f}",
-         "a gradient [ms]": number(1e3 * f.seconds / f.gradients),
-         "smallest bulk ESS": f"{size:.0f}", "processor [s]": number(f.seconds),
-         "ESS per second": number(rate)}
+        {"way": f.way, "draws": len(f.theta), "smallest bulk ESS": f"{size:.0f}",
+         "processor [s]": number(f.seconds), "ESS per second": number(rate)}
         for f, size, rate in zip(drawn, sizes, each, strict=True)
     ]  # fmt: skip
     return TitledTable(

@@ -83,11 +83,6 @@ AMPLIFIER = named(
 ELECTRICAL = ("current limit", "leakage")
 
 
-def amplified(command: Floats, run: Run) -> Floats:
-    """Return the amplifier's output."""
-    return run.changed(AMPLIFIER, command)
-
-
 def stack_voltage(output: Floats, run: Run) -> Floats:
     """Return the voltage on the stack behind R_s C_p, of which a leak keeps what is fast."""
     hidden = run.record.hidden
@@ -404,11 +399,6 @@ READING = named(
 )
 #: Step of the reading, as a share of the noise's rms.
 QUANTUM = 0.2
-
-
-def reading(displacement: Floats, run: Run) -> Floats:
-    """Return what the sensor reads of a displacement, without noise."""
-    return run.changed(READING, displacement)
 
 
 def with_noise(clean: Floats, record: Record) -> Floats:

@@ -1,7 +1,6 @@
 """The cases: records with known causes, measured ones, models of users, and exports."""
 
 import json
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -288,8 +287,3 @@ def _all() -> Iterator[Case]:
 
 
 CASES = {case.id: case for case in _all()}
-
-
-def chosen(pattern: str) -> list[Case]:
-    """Return the cases whose kind/name has a pattern."""
-    return [case for case in CASES.values() if re.search(pattern, case.id)]

@@ -24,14 +24,12 @@ from tests.studies.benchmarks.hidden_cases import (
     how_made,
 )
 from tests.studies.benchmarks.table import on_all_cores
-from tests.studies.plants.again import play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
-from tests.studies.plants.hide import SEARCH
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.hide import FREE, SEARCH, base_columns
+from tests.studies.plants.make import Truth, make_record, play_again
 from tests.studies.plants.sensor import room, temperature
 from tests.studies.plants.table import FOREIGN, KNOWN, called
-from tests.studies.plants.visibility import FREE, base_columns
 
 #: Shares of the kinds of cases; what is left over goes to the first.
 SHARES = {"known": 0.5, "clean": 0.2, "foreign": 0.1, "weak": 0.1, "two": 0.1}
@@ -131,17 +129,22 @@ def _later(effect: str | None, steps: int) -> str | None:
 
 
 def _halves(case: Case, truth: Truth, path: Path) -> tuple[Half, Half]:
-    """Return the record that is at a path, and the held-out one."""
-    rng = np.random.default_rng([case.seed, 3])
+    """Return the record at a path, and the held-out one; the base is fitted to the first."""
+    rng, again = np.random.default_rng([case.seed, 3]), path.with_name("holdout.csv")
     walk = _thermometer(truth, rng)
-    played = draw_excitation(rng, truth.excitation, truth.stack.u_rated)
-    first = truth.times, truth.voltage, _read(path), truth.displacement
-    again = path.with_name("holdout.csv")
-    clean = play_again(truth, case.seed + 1, again, played)
-    record = _half(truth, first, truth.base_displacement, walk, None)
-    base = simulate_base(truth.stack, *played).displacement
-    fitted = _fitted(record, truth.base_displacement)
-    return record, _half(truth, (*played, _read(again), clean), base, walk, fitted)
+    times, voltage = draw_excitation(rng, truth.excitation, truth.stack.u_rated)
+    clean = play_again(truth, case.seed + 1, again, (times, voltage))
+    first, base = truth.base_displacement, simulate_base(truth.stack, times, voltage).displacement
+    columns = base_columns(truth.stack, truth.times, truth.voltage, first)
+    later = base_columns(truth.stack, times, voltage, base)
+    read = _read(path)
+    moves = _fitted(columns, read - first)
+    return Half(
+        truth.times, truth.voltage, read, truth.displacement, room(truth.times, walk),
+        first + columns @ moves, columns,
+    ), Half(
+        times, voltage, _read(again), clean, room(times, walk), base + later @ moves, later
+    )  # fmt: skip
 
 
 def _thermometer(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
@@ -158,29 +161,11 @@ def _read(path: Path) -> FloatArray:
     return 1e-6 * np.asarray(table[:, 2], dtype=np.float64)
 
 
-def _half(
-    truth: Truth,
-    signals: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    base: FloatArray,
-    walk: dict[str, float],
-    fitted: FloatArray | None,
-) -> Half:
-    """Return a record with its base, which is fitted to it if `fitted` is None."""
-    times, voltage, read, clean = signals
-    columns = base_columns(truth.stack, times, voltage, base)
-    bare = Half(times, voltage, read, clean, room(times, walk), base, columns)
-    moves = _fitted(bare, base) if fitted is None else fitted
-    return bare._replace(base=base + columns @ moves)
-
-
-def _fitted(half: Half, base: FloatArray) -> FloatArray:
+def _fitted(columns: FloatArray, rest: FloatArray) -> FloatArray:
     """Return the Gauss-Newton step of the base from the device's values, (11,)."""
-    output = np.isfinite(half.read)
-    size = np.linalg.norm(half.columns, axis=0)
-    result = np.linalg.lstsq((half.columns / size)[output], (half.read - base)[output], rcond=1e-8)[
-        0
-    ]
-    return np.asarray(result / size, dtype=np.float64)
+    there, size = np.isfinite(rest), np.linalg.norm(columns, axis=0)
+    step = np.linalg.lstsq((columns / size)[there], rest[there], rcond=1e-8)[0]
+    return np.asarray(step / size, dtype=np.float64)
 
 
 #: Letters of the equations that are no parameters.
