@@ -18,7 +18,7 @@ from psa_casadi.report.words.remedy_words import effect_advice, effect_size
 from psa_casadi.report.words.tables import Table, effect_parameter_table
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
-#: The page that runs every effect; its name with a sharp and an effect's begins with that one.
+#: The page that runs every effect; its name with # and an effect starts with that effect.
 PLAYGROUND = "playground.html"
 
 

@@ -25,7 +25,7 @@ from psa_casadi.version import __version__
 from tests.tiers import slow
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-#: What an installed package reads at run time, beside its modules.
+#: What an installed package reads at run time, besides its modules.
 DATA = (
     "psa_casadi/data/demo.csv",
     "psa_casadi/py.typed",
@@ -210,7 +210,7 @@ def test_the_workflow_runs_every_python_that_is_promised() -> None:
     assert lowest == [CLASSIFIED[0], CLASSIFIED[-1]]
 
 
-#: What others wrote is loaded once; each of our modules is then imported in a fork of its own.
+#: What others wrote is loaded once; each of our modules is then imported in a separate fork.
 SCRIPT = """
 import importlib, os, sys
 import casadi, fmpy, h5py, msgspec, numpy, pint, scipy, typer

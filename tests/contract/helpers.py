@@ -27,7 +27,7 @@ SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasatt
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: exit code, and what it said."""
+    """How a command ended: exit code and output."""
 
     code: int
     out: str
@@ -35,7 +35,7 @@ class Ended:
 
     @property
     def words(self) -> str:
-        """All it said, with every white space as one."""
+        """The whole output, with single spaces."""
         return " ".join((self.out + " " + self.err).split())
 
 

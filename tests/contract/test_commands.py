@@ -50,7 +50,7 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message_part"),
     [
         (("identfy",), "identfy"),
         (("simulate", "--stack", "demo"), "--input"),
@@ -97,7 +97,7 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_told_with_exit_code_2(
-    words: tuple[str, ...], said: str, tmp_path: Path
+    words: tuple[str, ...], message_part: str, tmp_path: Path
 ) -> None:
     (tmp_path / "bytes").write_bytes(bytes(range(256)))
     (tmp_path / "good").write_bytes((DATA / "demo.csv").read_bytes())
@@ -106,7 +106,7 @@ def test_what_cannot_be_used_is_told_with_exit_code_2(
         "absent": tmp_path / "absent.csv", "demo": DATA / "demo.csv", "good": tmp_path / "good",
     }  # fmt: skip
     message = refused(*(w.format(**places) for w in words), folder=tmp_path)
-    assert said in message
+    assert message_part in message
     assert "Errno" not in message
 
 
@@ -220,7 +220,7 @@ def served(folder: Path) -> Iterator[tuple[str, str]]:
             result = re.search(r"http://(127\.0\.0\.1:\d+)/\?token=(\S+)", line)
             if result:
                 break
-        assert result, "no address was told"
+        assert result, "no address was printed"
         yield result[1], result[2]
     finally:
         running.send_signal(signal.SIGINT)
@@ -326,7 +326,7 @@ BENT_SCALE = psa.Component(
 
 
 def _oven(folder: Path) -> tuple[Path, Path]:
-    """Write a model of one's own, and a record whose sensor is bent, in other units."""
+    """Write a user's model, and a record whose sensor is bent, in other units."""
     model, record = folder / "oven.py", folder / "oven.csv"
     model.write_text(_MODEL, encoding="utf-8")
     rng, step = np.random.default_rng(1), 0.1
@@ -386,7 +386,7 @@ def test_a_model_of_ones_own_is_identified_and_diagnosed_on_the_command_line(
 def test_effects_of_ones_own_are_searched_in_a_model_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An effect at a port of the model, which fits beside no stack."""
+    """An effect at a port of the model, which fits no stack."""
     monkeypatch.chdir(tmp_path)
     model, record = _oven(tmp_path)
     Path("scale.py").write_text(_SCALE, encoding="utf-8")

@@ -358,7 +358,7 @@ def test_a_record_without_a_cause_is_adequate() -> None:
     second = frame["held_out"][frame["record"] == "kept"]
     assert len(second) == 1501
     assert not frame["held_out"][frame["record"] != "kept"].any()
-    assert second.mean() > 0.85  # its first part finds the state that it begins in
+    assert second.mean() > 0.85  # its first part determines the initial state
     assert d.causes == ()
     assert d.extended_errors == d.base_errors
     noise = 1e-3 * np.ptp(columns["displacement [um]"]) * 1e-6

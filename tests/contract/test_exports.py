@@ -1,4 +1,4 @@
-"""Exports: FMUs in fmpy beside the independent reference, Modelica, C, SSP, FMUs that are read."""
+"""Exports: FMUs in fmpy against the independent reference, Modelica, C, SSP, FMUs that are read."""
 
 import ctypes
 import json

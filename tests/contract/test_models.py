@@ -1,4 +1,4 @@
-"""Models: MODEL.json, the independent reference, effects, parts, and models of one's own."""
+"""Models: MODEL.json, the independent reference, effects, parts, and models of users."""
 
 import json
 from collections.abc import Callable
@@ -28,9 +28,9 @@ STACK = "P-885.51"
 AGREES = 1e-6
 
 
-def off(found: Floats, expected: Floats) -> float:
+def off(result: Floats, expected: Floats) -> float:
     """Return the largest difference over the range."""
-    return float(np.max(np.abs(found - expected)) / np.ptp(expected))
+    return float(np.max(np.abs(result - expected)) / np.ptp(expected))
 
 
 # --- simulation ---
@@ -124,21 +124,21 @@ def test_creep_after_a_step_is_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "shown"),
+    ("name", "values", "delayed"),
     [
         ("sensor_lag", {"sensor_lag_time": 2e-3}, lambda x, dx, d2x: x - 2e-3 * dx + 4e-6 * d2x),
         ("sensor_delay", {"sensor_delay": 1e-3}, lambda x, dx, d2x: x - 1e-3 * dx + 5e-7 * d2x),
     ],
 )  # fmt: skip
 def test_what_the_sensor_shows_late_is_late_by_its_time(
-    name: str, values: dict[str, float], shown: Callable[..., Floats]
+    name: str, values: dict[str, float], delayed: Callable[..., Floats]
 ) -> None:
     model = psa.stack_model(STACK).with_effect(psa.EFFECTS[name], values)
     time = np.linspace(0.0, 2.0, 4001)
     result = psa.simulate(model, time, 50.0 - 50.0 * np.cos(2.0 * np.pi * time))
     x = result.outputs["displacement"]
     spline = make_interp_spline(time, x, 5)
-    expected = shown(x, spline.derivative(1)(time), spline.derivative(2)(time))
+    expected = delayed(x, spline.derivative(1)(time), spline.derivative(2)(time))
     smooth = (np.abs((2.0 * time) % 1.0 - 0.5) < 0.3) & (time > 0.5)
     late = result.outputs["measured_displacement"]
     assert np.max(np.abs(late - expected)[smooth]) < 2e-3 * np.max(np.abs(late - x))
@@ -257,7 +257,7 @@ def test_named_stacks_have_their_published_figures() -> None:
         psa.stack_model("P-885.52")
 
 
-# --- effects of one's own ---
+# --- effects of users ---
 
 PICKUP = """
 import psa_casadi as psa
@@ -315,7 +315,7 @@ def test_an_effect_of_ones_own_is_shown_simulated_and_saved_by_reference(
     assert "pickup_time" in Path("x.mo").read_text("utf-8")
 
 
-# --- models of one's own, parts, systems ---
+# --- models of users, parts, systems ---
 
 
 def van_der_pol() -> psa.Model:

@@ -1,4 +1,4 @@
-"""Records: units, layouts, formats, missing readings, several files, and mistakes told by place."""
+"""Records: units, layouts, formats, missing readings, several files, mistakes with their place."""
 
 import hashlib
 from pathlib import Path

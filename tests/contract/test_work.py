@@ -1,4 +1,4 @@
-"""Designs, many devices, own models' diagnosis, posteriors: longer work and what it leaves."""
+"""Designs, many devices, diagnoses of users' models, posteriors: longer work and its files."""
 
 import csv
 import json
@@ -137,7 +137,7 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
 
 
 def test_friction_of_a_motor_is_found_with_its_size(tmp_path: Path) -> None:
-    """A model of one's own, and a plant with other equations and dry friction at its shaft."""
+    """A user's model, and a plant with other equations and dry friction at its shaft."""
     d = psa.diagnose(motor(), own_plants.motor(1))
     assert isinstance(d, psa.Diagnosis)
     assert d.verdict == "cause_named"

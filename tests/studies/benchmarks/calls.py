@@ -37,7 +37,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
         if len(lines) == 1:
             summary.append({"importer": name} | dict.fromkeys(_HEADS, "-") | {"read": lines[0]})
             continue
-        summary.append({"importer": name, **_told(lines)})
+        summary.append({"importer": name, **_values_by_phase(lines)})
         rows = [{"call": line} for line in _shortened(lines)]
         tables.append(TitledTable(name, rows))
     what = TitledTable("The input u = t in the step from 0.1 s to 0.2 s", summary)
@@ -62,7 +62,7 @@ def _logged(name: str, importer: Callable[[Path], None]) -> list[str]:
 _HEADS = ("before initialization", "in it", "in the step", "read")
 
 
-def _told(lines: list[str]) -> Row:
+def _values_by_phase(lines: list[str]) -> Row:
     """Return which values of u there are before, in and after initialization, and in the step."""
     enter, leave = (lines.index(f"{w}InitializationMode") for w in ("Enter", "Exit"))
     after = lines[leave:]
