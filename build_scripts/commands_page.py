@@ -11,7 +11,7 @@ from psa_casadi.cli.app import app
 
 PAGE = "commands.md"
 
-#: What is shortened with dots stands below in full.
+#: Shortened lists, which follow in full.
 _SHORTENED = re.compile(r"^\*\*Commands\*\*:\n\n(?:\* .*\n)+\n?", re.MULTILINE)
 _EXAMPLE = re.compile(r"^(?:\x08\n)?Example: (psa .*)$", re.MULTILINE)
 _TITLE = re.compile(r"\A# .*\n+")

@@ -1,7 +1,7 @@
 """Compile every C file of the project as strict C99, with warnings as errors.
 
 The sources are those an FMU carries and those of the library that the Python side simulates with:
-the files of `fmu_src/` and the code generated for a model. Each is a translation unit of its own
+the files of `fmu_src/` and the code generated for a model. Each is a separate translation unit
 for zig's C compiler, which is started once for a folder: its start took most of the time. They are
 optimised, because some warnings need the optimiser's analysis; all others come at every level.
 Exact steps are vectors of numbers, an extension of C99, and compiled for one number and for four.
@@ -41,7 +41,7 @@ LANES = (1, 4)
 
 @dataclass(frozen=True)
 class Work:
-    """Files of one folder that are compiled alike, where their headers are, and how."""
+    """Files of one folder with the same flags, where their headers are, and the flags."""
 
     sources: tuple[Path, ...]
     include: tuple[Path, ...]
@@ -49,12 +49,12 @@ class Work:
 
     @property
     def name(self) -> str:
-        """Folder and last flag, as they are told."""
+        """Folder and last flag."""
         return f"{self.sources[0].parent.name} {self.flags[-1]}"
 
 
 def compile_strictly(work: Work) -> list[str]:
-    """Compile the files, each on its own; return the complaints."""
+    """Compile the files, each separately; return the complaints."""
     includes = [f"-I{directory}" for directory in work.include]
     command = [sys.executable, "-m", "ziglang", "cc", *work.flags, OPTIMISATION, *includes]
     command += ["-c", *map(str, work.sources)]
@@ -104,7 +104,7 @@ static const struct {
 
 
 def write_all(sources: Path) -> list[Work]:
-    """Write every source into folders of its own; return what is to be compiled.
+    """Write every source into separate folders; return what is to be compiled.
 
     The FMU of FMI 2 is that of the base model, that of FMI 3 and the library are those of the model
     with every effect, whose functions are the largest. Exact steps are those of the base, and of a

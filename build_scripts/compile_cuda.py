@@ -2,7 +2,7 @@
 
 The kernel of every named stack, of the base with each effect, of five and of all of them is
 compiled by NVRTC and assembled by ptxas for each compute capability, which needs no GPU; a line
-says what a thread takes. It needs `pip install --group cuda`, on Linux.
+states what a thread takes. It needs `pip install --group cuda`, on Linux.
 """
 
 import ctypes
@@ -23,7 +23,7 @@ from psa_casadi.simulation.simulate import SHOWN
 
 CAPABILITIES = ("80", "90")
 KERNEL = "psa_exact_sets"
-#: Effects with states, loops and groups of their own, together in one model.
+#: Effects with states, loops and groups, together in one model.
 FIVE = (
     "slow_creep", "load_stiffness", "rate_dependent_hysteresis", "backlash", "structural_mode",
 )  # fmt: skip
@@ -59,7 +59,7 @@ def tools() -> tuple[ctypes.CDLL, Path]:
 
 
 def compiled(nvrtc: ctypes.CDLL, text: str, capability: str) -> str:
-    """Return the PTX of CUDA C++; raises SystemExit with what the compiler says."""
+    """Return the PTX of CUDA C++; raises SystemExit with the output of the compiler."""
     program = ctypes.c_void_p()
     nvrtc.nvrtcCreateProgram(ctypes.byref(program), text.encode(), b"kernel.cu", 0, None, None)
     options = [q.encode() for q in (*OPTIONS, f"--gpu-architecture=compute_{capability}")]

@@ -23,7 +23,7 @@ from psa_casadi.report.words.tables import Table, effect_parameter_table
 from psa_casadi.simulation.sizes import Sizes
 
 PAGE, PICTURES = "effects.md", "pictures/effects"
-#: The page that runs every effect; its name with a sharp and an effect's begins with that one.
+#: The page that runs every effect; its name with # and an effect starts with that effect.
 PLAYGROUND = "playground.html"
 #: The heading of the page below which the effects of any model are.
 ANY_MODEL = "## Effects of any model"

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent
 def measured_data_directory() -> Path:
     """Return the directory of the measured records, which may not exist.
 
-    It is $PSA_CASADI_DATA, else `shared/data` beside the checkout.
+    It is $PSA_CASADI_DATA, else `shared/data` next to the checkout.
     """
     return Path(os.environ.get("PSA_CASADI_DATA") or ROOT.parent / "shared" / "data")
 

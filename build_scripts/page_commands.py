@@ -3,16 +3,15 @@ r"""Run the code that README.md and the pages in `docs/` show: what a reader see
 Executable are fenced blocks marked `console` (their lines that begin with `$ `; those that end in a
 backslash go on in the next one, all others are output and are left alone), `python` (a program) and
 `c` (statements of a program that is compiled with the C files of the folder). Each block runs in an
-empty directory of its own, with the checkout's environment first in PATH, two blocks side by side;
-what a command says is shown when it has ended. A comment on its own line before a block changes
-that:
+empty directory, with the checkout's environment first in PATH, two blocks side by side; the output
+of a command is printed when it has ended. A comment on its own line before a block changes that:
 
     <!-- run: skip, WHY -->   the block is not run (it installs something, it never ends)
     <!-- run: in-tests -->    the block is run by a test, which looks at what it leaves besides
     <!-- run: needs-data -->  the block runs where the measured records are, in $PSA_CASADI_DATA
     <!-- run: continue -->    the block runs in the directory of the block before it
     <!-- before: COMMAND -->  runs first, to make files that the block takes for granted, as a
-                              reader's own record: $DEMO_RECORD is that of the demonstration
+                              reader's record: $DEMO_RECORD is that of the demonstration
 """
 
 import os
@@ -49,7 +48,7 @@ _PROGRAMS = {
 
 @dataclass(frozen=True)
 class Block:
-    """What runs for one fenced block, its page, the line it begins in, and its marks."""
+    """What runs for one fenced block, its page, its first line, and its marks."""
 
     line: int
     commands: tuple[str, ...]
@@ -58,7 +57,7 @@ class Block:
 
     @property
     def place(self) -> str:
-        """Page and line, as they are told."""
+        """Page and line."""
         return f"{self.page} line {self.line}"
 
 
@@ -146,7 +145,7 @@ def run_block(block: Block, directory: Path) -> str | None:
 
 
 def _tell(command: str, data: bytes | None, end: str) -> None:
-    """Print a command and what it said at once, so that two do not mix."""
+    """Print a command and its output at once, so that two do not mix."""
     text = (data or b"").decode("utf-8", "replace")
     print(f"$ {command.partition(chr(10))[0]}\n{text}  [{end}]\n", end="", flush=True)
 

@@ -21,13 +21,13 @@ from build_scripts.measured_data import measured_data_directory, must_be_present
 from tests.check_here import rows_here
 
 #: Groups of tests that share something long, the longest first.
-LONG_GROUPS = ("platforms", "identification", "demo", "search", "verification", "browser")
+LONG_GROUPS = ("platforms", "identification", "demo", "search", "browser")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let a test file that is named run whole: the quick tier is of all files together."""
     sys.dont_write_bytecode = False
-    if hasattr(config, "workerinput"):  # a process of pytest-xdist does what the first one says
+    if hasattr(config, "workerinput"):  # a process of pytest-xdist does as the first one
         return
     chosen = any(str(word).startswith("-m") for word in config.invocation_params.args)
     if not chosen and all(".py" in arg for arg in config.args):
@@ -67,7 +67,7 @@ def code_runs_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def without_binary(monkeypatch: pytest.MonkeyPatch) -> None:
-    """FMUs are written without their binary, for tests that read the files beside it."""
+    """FMUs are written without their binary, for tests that read its other files."""
     monkeypatch.setattr("psa_casadi.export.fmu.archive.compile_library", lambda *_: b"no binary")
 
 

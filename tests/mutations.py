@@ -1,4 +1,4 @@
-"""What a call says of content that may be wrong."""
+"""The messages of a call on content that may be wrong."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ from psa_casadi.errors import InputError
 
 
 def sentences(call: Callable[[], object]) -> tuple[str, ...]:
-    """Return the sentences with which a call refuses what it is given, none where it does not."""
+    """Return the sentences with which a call refuses its arguments, none if it accepts them."""
     try:
         call()
     except InputError as error:

@@ -104,7 +104,7 @@ def test_problems_beyond_the_limit_are_counted() -> None:
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of POSIX")
 
-#: Makes a folder and a half-written file in a place, tells so, and waits to be killed.
+#: Makes a folder and a half-written file in a place, prints "ready", and waits to be killed.
 HOLDS = """
 import pathlib, sys, time
 from psa_casadi.files import temporary_file, temporary_folder
@@ -241,18 +241,18 @@ def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) 
     assert sorted(os.listdir(tmp_path)) == ["f.mat", "pid", "python"]
 
 
-#: Is told to end when its child runs, and `Popen` has not come back with it yet.
+#: Gets SIGTERM when its child runs, and `Popen` has not returned yet.
 STARTS = """
 import os, subprocess, sys
 from psa_casadi.children import started
 from psa_casadi.files import answer_requests_to_end
 popen = subprocess.Popen
-def told(*given, **options):
-    child = popen(*given, **options)
+def ended_at_once(*arguments, **options):
+    child = popen(*arguments, **options)
     print(child.pid, flush=True)
     os.kill(os.getpid(), 15)
     return child
-subprocess.Popen = told
+subprocess.Popen = ended_at_once
 answer_requests_to_end()
 with started(["sleep", "60"]):
     print("goes on")
@@ -268,8 +268,8 @@ def test_a_child_that_is_just_being_started_is_ended_too() -> None:
     assert ended(int(done.stdout))
 
 
-#: Is told to end in a block that answers, or after it.
-TOLD = """
+#: Gets SIGTERM in a block that answers, or after it.
+TERMINATED = """
 import os, pathlib, sys
 from psa_casadi.files import requests_to_end_answered, temporary_folder
 with requests_to_end_answered(), temporary_folder(pathlib.Path(sys.argv[1])):
@@ -285,7 +285,7 @@ with temporary_folder(pathlib.Path(sys.argv[1])):
 def test_requests_to_end_are_answered_in_the_block_alone(
     where: str, code: int, left: int, tmp_path: Path
 ) -> None:
-    done = subprocess.run([sys.executable, "-c", TOLD, str(tmp_path), where], check=False)
+    done = subprocess.run([sys.executable, "-c", TERMINATED, str(tmp_path), where], check=False)
     assert done.returncode == code
     assert len(os.listdir(tmp_path)) == left
 

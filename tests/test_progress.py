@@ -24,17 +24,17 @@ def work(count: int, *, progress: Callable[[str], None] = silent) -> int:
 
 
 def test_a_line_is_shown_on_a_terminal_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal, plain, requested = Terminal(), io.StringIO(), list[str]()
+    terminal, plain, steps = Terminal(), io.StringIO(), list[str]()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("COLUMNS", "40")
     assert work(3) == 3
-    assert work(4, progress=requested.append) == 4
+    assert work(4, progress=steps.append) == 4
     line, last = terminal.getvalue().split("\r\x1b[K")[1:]
     assert (line, last) == ("work: step 3 of many " + "x" * 18, "")
     monkeypatch.setattr(sys, "stderr", plain)
     assert work(5) == 5
     assert plain.getvalue() == ""
-    assert requested[0].startswith("step 4")
+    assert steps[0].startswith("step 4")
 
 
 def test_a_fit_of_any_model_tells(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,7 +25,7 @@ from psa_casadi.version import __version__
 from tests.tiers import slow
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-#: What an installed package reads at run time, beside its modules.
+#: What an installed package reads at run time, besides its modules.
 DATA = (
     "psa_casadi/data/demo.csv",
     "psa_casadi/py.typed",
@@ -161,12 +161,12 @@ def _third_party() -> frozenset[tuple[Path, str, bool]]:
 
     Each package here is imported under the name that it is installed by, in lower case.
     """
-    item = {*sys.stdlib_module_names, "psa_casadi"}
+    ours = {*sys.stdlib_module_names, "psa_casadi"}
     return frozenset(
         (path, name, inside)
         for path, tree in _trees().items()
         for name, inside in _imports(tree)
-        if name not in item
+        if name not in ours
     )
 
 
@@ -197,8 +197,8 @@ def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
 
 
 def test_the_developers_install_has_every_extra() -> None:
-    (item,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
-    assert item.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
+    (whole,) = [r for r in EXTRAS["dev"] if r.name == PROJECT["name"]]
+    assert whole.extras == EXTRAS.keys() - {"dev", "gpu"}  # which is large, and for one system
 
 
 def test_the_workflow_runs_every_python_that_is_promised() -> None:
@@ -210,7 +210,7 @@ def test_the_workflow_runs_every_python_that_is_promised() -> None:
     assert lowest == [CLASSIFIED[0], CLASSIFIED[-1]]
 
 
-#: What others wrote is loaded once; each of our modules is then imported in a fork of its own.
+#: What others wrote is loaded once; each of our modules is then imported in a separate fork.
 SCRIPT = """
 import importlib, os, sys
 import casadi, fmpy, h5py, msgspec, numpy, pint, scipy, typer

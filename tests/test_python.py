@@ -84,7 +84,7 @@ T = np.arange(64) * 1e-3
 V = 50.0 - 50.0 * np.cos(40.0 * T)
 X = 0.1 * V + 0.01 * np.sin(7.0 * T)
 TABLE = {"time [ms]": 1e3 * T, "voltage [V]": V, "displacement [um]": X}
-#: What is asked of a diagnosis, whether it was just made or is read back.
+#: Attributes of a diagnosis, new or loaded.
 ANSWERS = (
     "verdict", "causes", "candidates", "base_errors", "extended_errors", "gain",
     "noise_floor_rms_m", "kept", "doubt", "notes",
@@ -98,7 +98,7 @@ def test_a_missing_reading_of_a_frame_is_missing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"displacement [um]": X[:-1]}, "has 63 values"),
         ({"displacement [um]": ["a"] * 64}, "not all numbers"),
@@ -106,9 +106,9 @@ def test_a_missing_reading_of_a_frame_is_missing() -> None:
         ({"time [ms]": T[::-1]}, "time"),
     ],
 )
-def test_a_wrong_table_is_refused_as_a_file_is(changed: dict[str, object], said: str) -> None:
+def test_a_wrong_table_is_refused_as_a_file_is(changed: dict[str, object], message: str) -> None:
     table = {k: v for k, v in TABLE.items() if k.split()[0] != next(iter(changed)).split()[0]}
-    with pytest.raises(psa.InputError, match=said):
+    with pytest.raises(psa.InputError, match=message):
         psa.record_from({**table, **changed})  # type: ignore[dict-item]
 
 
@@ -178,10 +178,10 @@ def test_a_diagnosis_is_loaded_back(verdict: Verdict, tmp_path: Path) -> None:
 
 def test_what_is_no_diagnosis_is_not_loaded(tmp_path: Path) -> None:
     path = tmp_path / "x.json"
-    for text, statement in (("{}", "no diagnosis"), ("[", "x.json"), (
+    for text, message in (("{}", "no diagnosis"), ("[", "x.json"), (
         '{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing")):  # fmt: skip
         path.write_text(text, encoding="utf-8")
-        with pytest.raises(psa.InputError, match=statement):
+        with pytest.raises(psa.InputError, match=message):
             psa.load_diagnosis(path)
     with pytest.raises(psa.InputError, match=r"none\.json"):
         psa.load_diagnosis(tmp_path / "none.json")
@@ -205,8 +205,8 @@ def stack() -> psa.Model:
 
 
 @cache
-def own() -> tuple[psa.Signals, psa.Identification, psa.Diagnosis]:
-    """Return a record of an oscillator with a stop, and what is found in it."""
+def swing() -> tuple[psa.Signals, psa.Identification, psa.Diagnosis]:
+    """Return a record of an oscillator with a stop, its fit and its diagnosis."""
     model = oscillator()
     t = np.linspace(0.0, 0.599, 600)
     force = 40.0 * np.sin(25.0 * t) + 15.0 * np.sin(61.0 * t)
@@ -218,7 +218,7 @@ def own() -> tuple[psa.Signals, psa.Identification, psa.Diagnosis]:
 
 
 def block(made: Any, *samples: float) -> list[float]:
-    """Return what a block says next, without moving it on."""
+    """Return the next output of a block, without moving it on."""
     return [pickle.loads(pickle.dumps(made)).step(*samples)]
 
 
@@ -259,13 +259,13 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
         lambda: diagnosis("adequate").experiments[0].record,
         lambda r: [r.time, r.voltage, r.displacement, r.sha256],
     ),
-    "Signals": (lambda: own()[0], lambda s: [s.time, *s.columns.values(), s.sha256]),
+    "Signals": (lambda: swing()[0], lambda s: [s.time, *s.columns.values(), s.sha256]),
     "Trajectory": (
         lambda: psa.simulate(stack(), TIMES, WAVE),
         lambda t: [t.displacement, *t.states.values(), t.way],
     ),
     "Identification": (
-        lambda: own()[1],
+        lambda: swing()[1],
         lambda i: [*i.fit.outputs(i.experiments), repr(i), i.to_json(), *driven(i.model)],
     ),
     "StackIdentification": (
@@ -277,11 +277,11 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
         lambda d: [d.to_json(), repr(d), *d.base, *d.extended, *driven(d.model)],
     ),
     "Diagnosis": (
-        lambda: own()[2],
+        lambda: swing()[2],
         lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs(d.experiments)],
     ),
     "Comparison": (
-        lambda: psa.compare(own()[1], own()[2]), lambda c: [repr(c), *map(repr, c.differences)],
+        lambda: psa.compare(swing()[1], swing()[2]), lambda c: [repr(c), *map(repr, c.differences)],
     ),
     "HysteresisObserver": (
         lambda: moved(psa.HysteresisObserver(values()), 60.0), lambda b: block(b, 31.0),
@@ -318,7 +318,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
         lambda a: [a, a.grid(5)],
     ),
 }  # fmt: skip
-#: What is no result, or is pickled by a slow test of its own.
+#: What is no result, or is pickled by a separate slow test.
 _OTHER = {"Symbols", "Timings", "Posterior", "InputError", "MachineError", "PsaError"}
 
 
@@ -367,7 +367,7 @@ def test_errors_keep_their_sentences() -> None:
 
 
 def test_another_process_predicts_the_same(tmp_path: Path) -> None:
-    """A model of one's own, one of wired parts and one of an FMU, whose equations have no name."""
+    """A user's model, one of wired parts and one of an FMU, whose equations have no name."""
     fmu = psa.export_fmu(psa.part_model("flexure_stage"), tmp_path / "f.fmu")
     models = [oscillator(), psa.nanopositioner("P-885.51").model(), psa.fmu_model(fmu), stack()]
     (tmp_path / "models.pickle").write_bytes(pickle.dumps(models))
@@ -376,8 +376,8 @@ def test_another_process_predicts_the_same(tmp_path: Path) -> None:
         "models = pickle.load(open(sys.argv[1], 'rb'));"
         "np.savez(sys.argv[2], *[driven(m)[0] for m in models])"
     )
-    items = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
-    subprocess.run([sys.executable, "-c", code, *items], check=True)
+    paths = [str(tmp_path / "models.pickle"), str(tmp_path / "y.npz")]
+    subprocess.run([sys.executable, "-c", code, *paths], check=True)
     with np.load(tmp_path / "y.npz") as result:
         for model, y in zip(models, result.values(), strict=True):
             np.testing.assert_array_equal(y, driven(model)[0])

@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from contextvars import copy_context
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasatt
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: exit code, and what it said."""
+    """How a command ended: exit code and output."""
 
     code: int
     out: str
@@ -35,7 +35,7 @@ class Ended:
 
     @property
     def words(self) -> str:
-        """All it said, with every white space as one."""
+        """The whole output, with single spaces."""
         return " ".join((self.out + " " + self.err).split())
 
 
@@ -118,7 +118,9 @@ def reference_run(
     time = np.linspace(0.0, stop, samples)
     swing = np.cos(4.0 * np.pi * time / stop) * (1.0 - 0.3 * time / stop)
     voltage = 0.4 * values["u_rated"] * (1.0 - swing)
-    result = reference.simulate(
-        values, reference.from_samples(time, voltage), time, breakpoints=list(time)
-    )
-    return time, voltage, result
+    return time, voltage, on_reference(values, time, voltage)
+
+
+def on_reference(values: Mapping[str, float], t: Floats, v: Floats) -> reference.Trajectory:
+    """Return the run of the independent model under a voltage that is linear between samples."""
+    return reference.simulate(values, reference.from_samples(t, v), t, breakpoints=list(t))

@@ -139,14 +139,14 @@ def test_held_out_errors_are_those_of_samples_that_no_fit_saw(result: psa.StackD
     frame = result.to_frame()
     held = frame["held_out"].to_numpy()
     assert 0.2 < held.mean() < 0.3
-    for name, output in (("base", result.base_errors), ("extended", result.extended_errors)):
+    for name, errors in (("base", result.base_errors), ("extended", result.extended_errors)):
         misfit = (frame["measured [m]"] - frame[f"{name} [m]"]).to_numpy()
-        assert rms(misfit[held]) == pytest.approx(output.holdout_rms_m, rel=1e-6)
-        assert rms(misfit[~held]) == pytest.approx(output.train_rms_m, rel=1e-3)
-        assert np.nanmax(np.abs(misfit[held])) == pytest.approx(output.holdout_max_m, rel=1e-6)
+        assert rms(misfit[held]) == pytest.approx(errors.holdout_rms_m, rel=1e-6)
+        assert rms(misfit[~held]) == pytest.approx(errors.train_rms_m, rel=1e-3)
+        assert np.nanmax(np.abs(misfit[held])) == pytest.approx(errors.holdout_max_m, rel=1e-6)
         span = np.ptp(frame["measured [m]"])
-        share = 100.0 * output.holdout_rms_m / span
-        assert output.holdout_nrmse_percent == pytest.approx(share, rel=0.02)
+        share = 100.0 * errors.holdout_rms_m / span
+        assert errors.holdout_nrmse_percent == pytest.approx(share, rel=0.02)
 
 
 def test_a_diagnosis_is_loaded_back_and_pickled(demo: Demo, result: psa.StackDiagnosis) -> None:
@@ -157,8 +157,8 @@ def test_a_diagnosis_is_loaded_back_and_pickled(demo: Demo, result: psa.StackDia
     assert loaded.causes[0].parameters["creep_gain"].value == pytest.approx(
         result.causes[0].parameters["creep_gain"].value, rel=1e-6
     )
-    for output, item in zip(loaded.to_dict()["candidates"], result.candidates, strict=True):
-        assert output["evidence"] == pytest.approx(item.evidence, rel=1e-6, abs=1e-6)
+    for kept, candidate in zip(loaded.to_dict()["candidates"], result.candidates, strict=True):
+        assert kept["evidence"] == pytest.approx(candidate.evidence, rel=1e-6, abs=1e-6)
     again = pickle.loads(pickle.dumps(result))
     assert again.to_json() == result.to_json()
     np.testing.assert_array_equal(again.extended[0], result.extended[0])
@@ -214,19 +214,19 @@ def test_results_show_themselves(result: psa.StackDiagnosis, tmp_path: Path) -> 
 
 def test_the_demos_fmu_repeats_the_run_that_it_carries(demo: Demo, tmp_path: Path) -> None:
     fmu = demo.folder / "extended.fmu"
-    statement = done(
+    text = done(
         "check", fmu, "--evidence", "--record", demo.folder / "synthetic_record.csv",
         "--json", tmp_path / "c.json",
     ).out  # fmt: skip
     for row in ("evidence inside", "records as stated", "reference run", "held-out error"):
-        assert row in statement
-    assert "FAIL" not in statement
+        assert row in text
+    assert "FAIL" not in text
     read(tmp_path / "c.json", "check")
     other = command("check", fmu, "--model", demo.folder / "model.json")
     assert (other.code, "FAIL" in other.out) == (1, True)
-    output = fmpy.read_model_description(str(fmu))
+    description = fmpy.read_model_description(str(fmu))
     extended = psa.load_model(demo.folder / "extended.json")
-    starts = {v.name: v.start for v in output.modelVariables if v.causality == "parameter"}
+    starts = {v.name: v.start for v in description.modelVariables if v.causality == "parameter"}
     assert float(starts["creep_gain"]) == extended.values["creep_gain"]
 
 
@@ -240,15 +240,13 @@ def test_two_devices_are_side_by_side_on_a_page(demo: Demo, tmp_path: Path) -> N
     }
     (tmp_path / "other.json").write_text(json.dumps(other), encoding="utf-8")
     page = tmp_path / "compare.html"
-    statement = done(
-        "compare", demo.folder / "diagnosis.json", tmp_path / "other.json", "-o", page
-    ).out
-    assert "cause named" in statement
-    assert "adequate" in statement
-    displayed = Page(page.read_text("utf-8"))
-    assert displayed.loaded == []
+    text = done("compare", demo.folder / "diagnosis.json", tmp_path / "other.json", "-o", page).out
+    assert "cause named" in text
+    assert "adequate" in text
+    compared = Page(page.read_text("utf-8"))
+    assert compared.loaded == []
     for part in ("slow creep", "99 %", "cause named", "adequate", "other"):
-        assert part in displayed.text
+        assert part in compared.text
     assert "nothing to compare" in refused("compare", demo.folder / "diagnosis.json", "-o", page)
 
 
@@ -268,7 +266,7 @@ def junit(path: Path) -> dict[str, bool]:
 
 
 def test_what_is_expected_decides_the_exit_code(tmp_path: Path) -> None:
-    requested: tuple[str | Path, ...] = (
+    arguments: tuple[str | Path, ...] = (
         "diagnose",
         DATA / "demo.csv",
         *LEFT_OUT,
@@ -276,10 +274,10 @@ def test_what_is_expected_decides_the_exit_code(tmp_path: Path) -> None:
         "--junit",
         tmp_path / "d.xml",
     )
-    right = command(*requested, "--expect", "adequate,cause_named", "--max-error", "0.5%")
+    right = command(*arguments, "--expect", "adequate,cause_named", "--max-error", "0.5%")
     assert (right.code, right.out, right.err) == (0, "", "")
     assert junit(tmp_path / "d.xml") == {"verdict": False, "held-out error": False}
-    wrong = command(*requested, "--expect", "adequate", "--max-error", "0.1%")
+    wrong = command(*arguments, "--expect", "adequate", "--max-error", "0.1%")
     assert wrong.code == 1
     assert "cause_named; expected adequate" in wrong.words
     assert re.search(r"0\.19\d* % of the range; expected 0\.1 %", wrong.words)
@@ -327,7 +325,7 @@ def noisy(seed: int, share: float = 1e-3) -> dict[str, Floats]:
 def test_parameters_are_identified_within_their_intervals(tmp_path: Path) -> None:
     path, model = write(tmp_path / "r.csv", noisy(1)), tmp_path / "m.json"
     truth = psa.stack_model("P-885.51").values
-    statement = done(
+    text = done(
         "identify", path, "--stiffness", f"{truth['k_B']}", "-o", model, "--json",
         tmp_path / "i.json", "--report", tmp_path / "fit.html", "--still",
     ).out  # fmt: skip
@@ -343,8 +341,8 @@ def test_parameters_are_identified_within_their_intervals(tmp_path: Path) -> Non
     x = psa.simulate(psa.load_model(model), time, voltage, from_rest_at_zero=True).displacement
     miss = x - clean.displacement
     assert rms(miss - np.mean(miss)) < 5e-4 * np.ptp(clean.displacement)
-    assert "k_L" in statement
-    assert "95 % interval" in statement
+    assert "k_L" in text
+    assert "95 % interval" in text
     page = Page((tmp_path / "fit.html").read_text("utf-8"))
     assert page.loaded == []
     assert "N/V" in page.text
@@ -360,7 +358,7 @@ def test_a_record_without_a_cause_is_adequate() -> None:
     second = frame["held_out"][frame["record"] == "kept"]
     assert len(second) == 1501
     assert not frame["held_out"][frame["record"] != "kept"].any()
-    assert second.mean() > 0.85  # its first part finds the state that it begins in
+    assert second.mean() > 0.85  # its first part determines the initial state
     assert d.causes == ()
     assert d.extended_errors == d.base_errors
     noise = 1e-3 * np.ptp(columns["displacement [um]"]) * 1e-6

@@ -1,4 +1,4 @@
-"""Exports: FMUs in fmpy beside the independent reference, Modelica, C, SSP, FMUs that are read."""
+"""Exports: FMUs in fmpy against the independent reference, Modelica, C, SSP, FMUs that are read."""
 
 import ctypes
 import json
@@ -60,12 +60,16 @@ def played(
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_an_fmu_is_valid_and_describes_its_ports(fmi: int) -> None:
     assert validate_fmu(str(fmu_of(fmi))) == []
-    output = fmpy.read_model_description(str(fmu_of(fmi)))
-    assert output.fmiVersion == ("2.0" if fmi == 2 else "3.0")
-    assert output.coSimulation.modelIdentifier == output.modelExchange.modelIdentifier == "P_885_51"
-    variables = {v.name: v for v in output.modelVariables}
-    inputs = [v.name for v in output.modelVariables if v.causality == "input"]
-    outputs = {v.name: v.unit for v in output.modelVariables if v.causality == "output"}
+    description = fmpy.read_model_description(str(fmu_of(fmi)))
+    assert description.fmiVersion == ("2.0" if fmi == 2 else "3.0")
+    assert (
+        description.coSimulation.modelIdentifier
+        == description.modelExchange.modelIdentifier
+        == "P_885_51"
+    )
+    variables = {v.name: v for v in description.modelVariables}
+    inputs = [v.name for v in description.modelVariables if v.causality == "input"]
+    outputs = {v.name: v.unit for v in description.modelVariables if v.causality == "output"}
     assert inputs == ["voltage", "load_force"]
     assert outputs == {
         "current": "A", "charge": "C", "displacement": "m", "velocity": "m/s", "blocked_force": "N",
@@ -80,12 +84,12 @@ def test_an_fmu_with_input_derivatives_agrees_with_the_independent_reference(
     tmp_path: Path,
 ) -> None:
     time, voltage, expected = reference_run()
-    output = fmpy.read_model_description(str(fmu_of(2)))
-    numbers = {v.name: v.valueReference for v in output.modelVariables}
+    description = fmpy.read_model_description(str(fmu_of(2)))
+    numbers = {v.name: v.valueReference for v in description.modelVariables}
     unpacked = fmpy.extract(str(fmu_of(2)), str(tmp_path))
     slave = FMU2Slave(
-        guid=output.guid, unzipDirectory=unpacked, instanceName="one",
-        modelIdentifier=output.coSimulation.modelIdentifier,
+        guid=description.guid, unzipDirectory=unpacked, instanceName="one",
+        modelIdentifier=description.coSimulation.modelIdentifier,
     )  # fmt: skip
     slave.instantiate()
     slave.setupExperiment(startTime=0.0, tolerance=1e-9)
@@ -164,15 +168,15 @@ def test_options_name_an_fmu_and_keep_the_sensor(tmp_path: Path) -> None:
     psa.save_model(model, tmp_path / "m.json")
     base = ("export", "fmu", "--model", tmp_path / "m.json", "-o", tmp_path / "x.fmu")
     assert "sensor_nonlinearity" in done(*base, "--name", "my_stack").out
-    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    assert output.coSimulation.modelIdentifier == "my_stack"
-    assert not [v.name for v in output.modelVariables if v.name.startswith("nonlinearity")]
+    description = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    assert description.coSimulation.modelIdentifier == "my_stack"
+    assert not [v.name for v in description.modelVariables if v.name.startswith("nonlinearity")]
     done(*base, "--include-sensor", "--author", "A. N. Other", "--version", "4.2")
-    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    names = [v.name for v in output.modelVariables]
+    description = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    names = [v.name for v in description.modelVariables]
     assert "measured_displacement" in names
     assert "nonlinearity_angle" in names
-    assert (output.author, output.version) == ("A. N. Other", "4.2")
+    assert (description.author, description.version) == ("A. N. Other", "4.2")
 
 
 def test_the_same_model_gives_the_same_bytes_and_carries_itself(tmp_path: Path) -> None:
@@ -233,23 +237,23 @@ def test_a_check_finds_a_description_that_was_spoiled(tmp_path: Path) -> None:
 def test_a_step_of_fixed_length_is_exported_for_co_simulation(tmp_path: Path) -> None:
     path = tmp_path / "fixed.fmu"
     done("export", "fmu", "--stack", STACK, "--solver", "fixed", "--step", "100us", "-o", path)
-    output = fmpy.read_model_description(str(path))
-    assert output.modelExchange is None
-    assert float(output.defaultExperiment.stepSize) == 1e-4
+    description = fmpy.read_model_description(str(path))
+    assert description.modelExchange is None
+    assert float(description.defaultExperiment.stepSize) == 1e-4
     time, voltage, expected = reference_run()
     result = played(path, time, {"voltage": voltage}, step_size=2e-4)
     x = np.interp(time, result["time"], result["displacement"])
     assert off(x, expected.displacement) < 0.02
-    statement = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
-    assert "--step" in statement
+    text = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
+    assert "--step" in text
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
 def test_c_for_a_controller_errs_as_little_as_it_says(precision: str, tmp_path: Path) -> None:
     compiler = shutil.which("cc") or pytest.skip("no C compiler")
-    statement = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
+    text = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
                 "--precision", precision, "-o", tmp_path / "code").out  # fmt: skip
-    assert "substeps" in statement or "%" in statement
+    assert "substeps" in text or "%" in text
     time, voltage, expected = reference_run()
     (tmp_path / "code" / "play.c").write_text(
         '#include "stack.h"\n'
@@ -302,10 +306,10 @@ def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None
 @slow
 def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> None:
     archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.svg"
-    statement = done("export", "ssp", "-o", archive, "--picture", picture).out
+    text = done("export", "ssp", "-o", archive, "--picture", picture).out
     parts = [c.name for c in read_ssd(str(archive)).system.elements]
     assert parts == ["controller", "compensator", "amplifier", "stack", "flexure"]
-    assert "reference" in statement
+    assert "reference" in text
     assert "controller" in picture.read_text("utf-8")
     result = simulate_ssp(
         str(archive), stop_time=2e-3, step_size=2.5e-6,
@@ -327,9 +331,9 @@ def test_an_fmu_of_an_own_model_is_read_back_and_runs_alike(tmp_path: Path) -> N
     read = psa.fmu_model(path, free={"mu": (0.1, 10.0)}, values={"mu": 2.3})
     time = np.linspace(0.0, 10.0, 501)
     nothing, start = np.empty((501, 0)), np.array([2.0, 0.0])
-    item = psa.run(van_der_pol().with_values({"mu": 2.3}), time, nothing, start, rtol=1e-8)
+    one = psa.run(van_der_pol().with_values({"mu": 2.3}), time, nothing, start, rtol=1e-8)
     result = psa.run(read, time, nothing, start, rtol=1e-8)
-    np.testing.assert_allclose(result.y, item.y, atol=1e-5)
+    np.testing.assert_allclose(result.y, one.y, atol=1e-5)
     assert read.output_names == ("position",)
     with pytest.raises(psa.InputError, match="FMU"):
         psa.export_fmu(read, tmp_path / "again.fmu")
@@ -341,8 +345,8 @@ def test_parts_are_exported(part: str, tmp_path: Path) -> None:
     assert validate_fmu(str(tmp_path / "x.fmu")) == []
     done("export", "modelica", "--part", part, "-o", tmp_path / "x.mo", "--name", "Part")
     values = psa.part_model(part).values
-    output = fmpy.read_model_description(str(tmp_path / "x.fmu"))
-    starts = {v.name: v.start for v in output.modelVariables if v.causality == "parameter"}
+    description = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    starts = {v.name: v.start for v in description.modelVariables if v.causality == "parameter"}
     assert {n: float(starts[n]) for n in values} == dict(values)
 
 

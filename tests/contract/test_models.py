@@ -1,4 +1,4 @@
-"""Models: MODEL.json, the independent reference, effects, parts, and models of one's own."""
+"""Models: MODEL.json, the independent reference, effects, parts, and models of users."""
 
 import json
 from collections.abc import Callable
@@ -12,17 +12,25 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
 import psa_casadi as psa
-from psa_casadi import reference
-from tests.contract.helpers import Floats, command, done, reference_run, refused, table, write
+from tests.contract.helpers import (
+    Floats,
+    command,
+    done,
+    on_reference,
+    reference_run,
+    refused,
+    table,
+    write,
+)
 
 STACK = "P-885.51"
 #: The share of the range to which a simulation agrees with the independent reference.
 AGREES = 1e-6
 
 
-def off(found: Floats, expected: Floats) -> float:
+def off(result: Floats, expected: Floats) -> float:
     """Return the largest difference over the range."""
-    return float(np.max(np.abs(found - expected)) / np.ptp(expected))
+    return float(np.max(np.abs(result - expected)) / np.ptp(expected))
 
 
 # --- simulation ---
@@ -116,21 +124,21 @@ def test_creep_after_a_step_is_its_closed_form() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "shown"),
+    ("name", "values", "delayed"),
     [
         ("sensor_lag", {"sensor_lag_time": 2e-3}, lambda x, dx, d2x: x - 2e-3 * dx + 4e-6 * d2x),
         ("sensor_delay", {"sensor_delay": 1e-3}, lambda x, dx, d2x: x - 1e-3 * dx + 5e-7 * d2x),
     ],
 )  # fmt: skip
 def test_what_the_sensor_shows_late_is_late_by_its_time(
-    name: str, values: dict[str, float], shown: Callable[..., Floats]
+    name: str, values: dict[str, float], delayed: Callable[..., Floats]
 ) -> None:
     model = psa.stack_model(STACK).with_effect(psa.EFFECTS[name], values)
     time = np.linspace(0.0, 2.0, 4001)
     result = psa.simulate(model, time, 50.0 - 50.0 * np.cos(2.0 * np.pi * time))
     x = result.outputs["displacement"]
     spline = make_interp_spline(time, x, 5)
-    expected = shown(x, spline.derivative(1)(time), spline.derivative(2)(time))
+    expected = delayed(x, spline.derivative(1)(time), spline.derivative(2)(time))
     smooth = (np.abs((2.0 * time) % 1.0 - 0.5) < 0.3) & (time > 0.5)
     late = result.outputs["measured_displacement"]
     assert np.max(np.abs(late - expected)[smooth]) < 2e-3 * np.max(np.abs(late - x))
@@ -144,18 +152,18 @@ def test_a_gain_of_0_removes_an_effect_exactly(name: str) -> None:
     one, other = (
         psa.simulate(m, time, voltage, from_rest_at_zero=True, rtol=1e-9) for m in (plain, with_it)
     )
-    items = [t.outputs["measured_displacement"] for t in (one, other)]
-    assert off(items[1], items[0]) < 1e-8
+    readings = [t.outputs["measured_displacement"] for t in (one, other)]
+    assert off(readings[1], readings[0]) < 1e-8
 
 
 def test_every_effect_is_listed_and_shown_with_equation_source_and_bounds() -> None:
     listed = done("effects", "--quiet").out.split()
     assert listed == list(psa.EFFECTS)
     assert len(listed) >= 27
-    displayed = done("effects", "slow_creep").words
+    text = done("effects", "slow_creep").words
     for part in ("creep_gain (z_1 + z_2 + z_3)", "Croft, Shed and Devasia", "belongs to plant",
                  "creep_time s 0.100", "0 to 0.500"):  # fmt: skip
-        assert part in displayed
+        assert part in text
     assert "did you mean slow_creep" in refused("effects", "slow_crep")
     for name, effect in psa.EFFECTS.items():
         assert effect.belongs_to in ("plant", "drive", "sensor", "environment"), name
@@ -209,15 +217,15 @@ MISTAKES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_a_mistake_in_a_model_file_is_named(case: str, saved: Path, tmp_path: Path) -> None:
-    change, statement = MISTAKES[case]
+    change, text = MISTAKES[case]
     content = json.loads(saved.read_text("utf-8"))
     change(content)
     saved.write_text(json.dumps(content), encoding="utf-8")
-    output = refused(
+    message = refused(
         "export", "modelica", "--model", saved, "-o", tmp_path / "x.mo", folder=tmp_path
     )
-    assert statement in output
-    assert "model.json" in output
+    assert text in message
+    assert "model.json" in message
     with pytest.raises(psa.InputError, match=r"model\.json"):
         psa.load_model(saved)
 
@@ -227,9 +235,9 @@ def test_mistakes_of_a_model_file_are_told_together(saved: Path) -> None:
     for change, _ in (MISTAKES["no number"], MISTAKES["interval"], MISTAKES["unknown effect"]):
         change(content)
     saved.write_text(json.dumps(content), encoding="utf-8")
-    with pytest.raises(psa.InputError) as output:
+    with pytest.raises(psa.InputError) as caught:
         psa.load_model(saved)
-    assert len(output.value.problems) >= 2
+    assert len(caught.value.problems) >= 2
     saved.write_text("{", encoding="utf-8")
     with pytest.raises(psa.InputError, match="is not JSON"):
         psa.load_model(saved)
@@ -243,13 +251,13 @@ def test_named_stacks_have_their_published_figures() -> None:
     assert (values["C_p"], values["u_rated"]) == (1.5e-6, 120.0)
     stroke = values["k_L"] * 120.0 * (1.0 / values["k_P"] + 1.0 / values["k_B"])
     assert 0.86 * stroke == pytest.approx(18e-6, rel=0.01)
-    displayed = done("stacks", STACK).words
-    assert "C_p 1.50000 uF Yang and Zhu 2015" in displayed
+    text = done("stacks", STACK).words
+    assert "C_p 1.50000 uF Yang and Zhu 2015" in text
     with pytest.raises(psa.InputError, match=r"P-885\.51"):
         psa.stack_model("P-885.52")
 
 
-# --- effects of one's own ---
+# --- effects of users ---
 
 PICKUP = """
 import psa_casadi as psa
@@ -281,9 +289,9 @@ def test_an_effect_of_ones_own_is_shown_simulated_and_saved_by_reference(
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     assert "pickup_gain" in done("effects", "sensor_pickup", "--effects", "pickup_of_mine").out
-    item = psa.own_effects("pickup_of_mine")["sensor_pickup"]
+    pickup = psa.own_effects("pickup_of_mine")["sensor_pickup"]
     plain = psa.stack_model(STACK)
-    model = plain.with_effect(item, {"pickup_gain": 4e-9, "pickup_time": 0.05})
+    model = plain.with_effect(pickup, {"pickup_gain": 4e-9, "pickup_time": 0.05})
     time = np.linspace(0.0, 0.4, 801)
     voltage = np.where(time < 0.1, 1000.0 * time, 100.0)
     picked = (
@@ -300,14 +308,14 @@ def test_an_effect_of_ones_own_is_shown_simulated_and_saved_by_reference(
     assert "equations" not in Path("m.json").read_text("utf-8")
     with pytest.raises(psa.InputError, match="pickup_of_mine"):
         psa.load_model("m.json")
-    assert psa.load_model("m.json", [item]).values["pickup_gain"] == 4e-9
+    assert psa.load_model("m.json", [pickup]).values["pickup_gain"] == 4e-9
     export = ("export", "modelica", "--model", "m.json", "-o", "x.mo", "--include-sensor")
     assert command(*export).code == 2
     done(*export, "--effects", "pickup_of_mine")
     assert "pickup_time" in Path("x.mo").read_text("utf-8")
 
 
-# --- models of one's own, parts, systems ---
+# --- models of users, parts, systems ---
 
 
 def van_der_pol() -> psa.Model:
@@ -325,12 +333,12 @@ def test_a_model_of_ones_own_is_saved_with_its_equations_as_text(tmp_path: Path)
     psa.save_model(model, file)
     content, result = json.loads(file.read_text("utf-8")), psa.load_model(file)
     assert content["components"] == ["VanDerPol"]
-    item = content["own"]["VanDerPol"]
-    assert item["equations"] == {
+    entry = content["own"]["VanDerPol"]
+    assert entry["equations"] == {
         "der": {"x": "v", "v": "mu * (1 - x ** 2) * v - x"}, "out": {"position": "x"},
     }  # fmt: skip
-    assert item["states"][0]["start"] == item["states"][0]["nominal"] == 2.0
-    assert item["parameters"][0]["bounds"] == [0.1, 10.0]
+    assert entry["states"][0]["start"] == entry["states"][0]["nominal"] == 2.0
+    assert entry["parameters"][0]["bounds"] == [0.1, 10.0]
     assert dict(result.values) == {"mu": 4.0 / 3.0}
     psa.save_model(result, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
@@ -367,7 +375,7 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
     np.testing.assert_allclose(columns["place [mm]"], 1e3 * expected, rtol=1e-5)
     np.testing.assert_allclose(columns["force [N]"], time, rtol=1e-12)
     plan = ("simulate", "--model", tmp_path / "m.json", "--input", ramp, "-o", tmp_path / "x.csv")
-    statement = done(
+    text = done(
         *plan,
         "--hold",
         "zero",
@@ -378,19 +386,19 @@ def test_a_file_of_ones_own_model_is_simulated_and_no_stacks_command_takes_it(
         "--figure",
         tmp_path / "p.png",
     ).words
-    assert "start: the start values of the model, but for x = 0.3 m" in statement
+    assert "start: the start values of the model, but for x = 0.3 m" in text
     held = [0.3]
     for u in time[:-1]:  # x' = u - 5 x with u constant over 0.01 s
         held.append(held[-1] * np.exp(-0.05) + u / 5.0 * (1.0 - np.exp(-0.05)))
     places = table(tmp_path / "x.csv")["place [mm]"]
     np.testing.assert_allclose(places, 1e3 * np.array(held), rtol=1e-5)
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
-    output = refused(*plan, "--start", "y=1", folder=tmp_path)
-    assert "no state or input 'y' to start from" in output
+    message = refused(*plan, "--start", "y=1", folder=tmp_path)
+    assert "no state or input 'y' to start from" in message
     assert "give NAME=VALUE" in refused(*plan, "--value", "k", folder=tmp_path)
     for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
-        output = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
-        assert "A model of your own is for `psa identify`," in output
+        message = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
+        assert "A model of your own is for `psa identify`," in message
 
 
 def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
@@ -398,7 +406,7 @@ def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
     psa.save_model(van_der_pol(), file)
     plain = json.loads(file.read_text("utf-8"))
     code = f"__import__('pathlib').Path({str(trace)!r}).touch() or x"
-    for text, statement in (
+    for text, words in (
         (code, "has a Python Call"),
         ("x.real", "has a Python Attribute"),
         ("open(x)", "calls open of 1"),
@@ -407,9 +415,9 @@ def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:
     ):
         plain["own"]["VanDerPol"]["equations"]["der"]["v"] = text
         file.write_text(json.dumps(plain), encoding="utf-8")
-        output = refused("export", "modelica", "--model", file, "-o", tmp_path / "x.mo")
-        assert statement in output
-        assert "'own.VanDerPol.equations.der.v'" in output
+        message = refused("export", "modelica", "--model", file, "-o", tmp_path / "x.mo")
+        assert words in message
+        assert "'own.VanDerPol.equations.der.v'" in message
     assert not trace.exists()
 
 
@@ -497,9 +505,7 @@ def test_blocks_for_a_control_loop_take_the_hysteresis_off() -> None:
     voltage = np.array([forward.step(float(w)) for w in wanted])
     values = model.values
     times = period * np.arange(400, dtype=np.float64)
-    reached = reference.simulate(
-        values, reference.from_samples(times, voltage), times, breakpoints=list(times)
-    ).displacement
+    reached = on_reference(values, times, voltage).displacement
     lag = values["tau"] + values["R_s"] * values["C_p"]
     late = np.interp(times - lag, times, wanted)
     plain = wanted / wanted.max() * voltage.max()

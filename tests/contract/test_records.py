@@ -1,4 +1,4 @@
-"""Records: units, layouts, formats, missing readings, several files, and mistakes told by place."""
+"""Records: units, layouts, formats, missing readings, several files, mistakes with their place."""
 
 import hashlib
 from pathlib import Path
@@ -116,12 +116,12 @@ def test_of_several_tables_in_a_file_one_is_chosen(tmp_path: Path) -> None:
 
 def test_every_mistake_of_all_files_is_told_at_once(tmp_path: Path) -> None:
     bad = lines(tmp_path / "bad.csv", HEADER, "0,a,1", "1,2,b", *ROWS[2:])
-    output = refused(
+    message = refused(
         "diagnose", bad, tmp_path / "absent.csv", "--model", tmp_path / "no.json",
         "-o", tmp_path / "missing" / "m.json", "--stiffness", "-3", folder=tmp_path,
     )  # fmt: skip
     parts = ("'a'", "'b'", "line 2", "line 3", "absent.csv", "no.json", "create it first", "-3 N/m")
-    assert [part for part in parts if part not in output] == []
+    assert [part for part in parts if part not in message] == []
 
 
 def test_records_that_cannot_be_fitted_are_refused(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Designs, many devices, own models' diagnosis, posteriors: longer work and what it leaves."""
+"""Designs, many devices, diagnoses of users' models, posteriors: longer work and its files."""
 
 import csv
 import json
@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi import reference
 from tests.any_model import own_plants
 from tests.any_model.own_models import motor
-from tests.contract.helpers import DATA, done, reference_run, refused, table, write
+from tests.contract.helpers import DATA, done, on_reference, reference_run, refused, table, write
 from tests.contract.test_models import off
 from tests.report.html_page import Page
 
@@ -22,7 +21,7 @@ STACK = "P-885.51"
 
 def test_a_designed_experiment_keeps_its_limits_and_separates(tmp_path: Path) -> None:
     out, page = tmp_path / "v.csv", tmp_path / "page.html"
-    statement = done(
+    text = done(
         "design", "experiment", "--stack", STACK, "--duration", "0.5", "--samples", "60",
         "--high", "60", "--rate", "2000", "--family", "triangles", "--starts", "1",
         "--separate", "sensor_nonlinearity", "slow_creep", "-o", out, "--report", page, "--still",
@@ -35,11 +34,11 @@ def test_a_designed_experiment_keeps_its_limits_and_separates(tmp_path: Path) ->
     assert voltage.max() <= 60.0
     assert np.max(np.abs(np.diff(voltage) / np.diff(time))) <= 2000.0 * 1.001
     assert np.ptp(voltage) > 30.0
-    assert "sensor nonlinearity" in statement
-    assert "slow creep" in statement
+    assert "sensor nonlinearity" in text
+    assert "slow creep" in text
     assert Page(page.read_text("utf-8")).loaded == []
-    output = refused("design", "experiment", "--stack", STACK, "--duration", "1", "--samples", "0")
-    assert "0 samples" in output
+    message = refused("design", "experiment", "--stack", STACK, "--duration", "1", "--samples", "0")
+    assert "0 samples" in message
 
 
 def test_a_designed_voltage_follows_its_path_on_the_independent_reference(tmp_path: Path) -> None:
@@ -53,9 +52,7 @@ def test_a_designed_voltage_follows_its_path_on_the_independent_reference(tmp_pa
     columns = table(tmp_path / "v.csv")
     t, v = columns["time [s]"], columns["voltage [V]"]
     assert v.max() <= 100.0
-    reached = reference.simulate(
-        psa.stack_model(STACK).values, reference.from_samples(t, v), t, breakpoints=list(t)
-    ).displacement
+    reached = on_reference(psa.stack_model(STACK).values, t, v).displacement
     assert off(1e6 * reached, np.interp(t, time, wanted)) < 2e-3
     plain = v.max() * wanted / wanted.max()
     assert np.max(np.abs(v - np.interp(t, time, plain))) > 0.03 * v.max()
@@ -101,12 +98,10 @@ def devices(tmp_path: Path) -> Path:
     ):  # fmt: skip
         values = dict(psa.stack_model(STACK).values)
         values["k_L"] *= force
-        x = reference.simulate(
-            values, reference.from_samples(time, voltage), time, breakpoints=list(time)
-        ).displacement
+        x = on_reference(values, time, voltage).displacement
         noise = 3e-3 * np.random.default_rng(seed).standard_normal(time.size)
-        displayed = {"time [s]": time, "voltage [V]": voltage, "displacement [um]": 1e6 * x + noise}
-        write(folder / path, displayed)
+        columns = {"time [s]": time, "voltage [V]": voltage, "displacement [um]": 1e6 * x + noise}
+        write(folder / path, columns)
     (folder / "third.csv").write_text("time [s],voltage [V],displacement [um]\n0,a,1\n")
     return folder
 
@@ -115,8 +110,8 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
     devices: Path, tmp_path: Path
 ) -> None:
     out, page = tmp_path / "results", tmp_path / "population.html"
-    statement = done("batch", devices, "-o", out, "--workers", "1", "--report", page).words
-    assert "5 devices: 4 done, 1 refused." in statement
+    text = done("batch", devices, "-o", out, "--workers", "1", "--report", page).words
+    assert "5 devices: 4 done, 1 refused." in text
     with (out / "summary.csv").open(encoding="utf-8") as stream:
         rows = {row["device"]: row for row in csv.DictReader(stream)}
     first = float(rows["first"]["k_L [N/V]"])
@@ -129,9 +124,9 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
             rules = json.loads((DATA / "schemas" / f"{kind}.schema.json").read_text("utf-8"))
             content = json.loads((out / name / f"{kind}.json").read_text("utf-8"))
             jsonschema.Draft202012Validator(rules).validate(content)
-    displayed = Page(page.read_text("utf-8"))
-    assert displayed.loaded == []
-    assert "third" in displayed.text
+    population = Page(page.read_text("utf-8"))
+    assert population.loaded == []
+    assert "third" in population.text
     (devices / "second.csv").write_bytes((devices / "fourth.csv").read_bytes())
     again = psa.batch(devices, out, workers=1)
     assert again.kept == 4
@@ -142,7 +137,7 @@ def test_many_devices_are_worked_on_and_one_that_fails_stops_none(
 
 
 def test_friction_of_a_motor_is_found_with_its_size(tmp_path: Path) -> None:
-    """A model of one's own, and a plant with other equations and dry friction at its shaft."""
+    """A user's model, and a plant with other equations and dry friction at its shaft."""
     d = psa.diagnose(motor(), own_plants.motor(1))
     assert isinstance(d, psa.Diagnosis)
     assert d.verdict == "cause_named"
@@ -181,16 +176,16 @@ def test_a_posterior_holds_the_truth(tmp_path: Path) -> None:
         psa.stack_model(STACK), [record], free=["k_L", "tau"], draws=150, tune=150, chains=1, seed=1
     )
     frame, truth = result.to_frame(), psa.stack_model(STACK).values
-    output = {row.name: row for row in frame.itertuples(index=False)}
+    rows = {row.name: row for row in frame.itertuples(index=False)}
     for name in ("k_L", "tau"):
-        assert abs(output[name].mean - truth[name]) < 5.0 * output[name].sd
-        assert output[name].low < output[name].mean < output[name].high
-        assert output[name].sd < 0.05 * truth[name]
+        assert abs(rows[name].mean - truth[name]) < 5.0 * rows[name].sd
+        assert rows[name].low < rows[name].mean < rows[name].high
+        assert rows[name].sd < 0.05 * truth[name]
     result.save(tmp_path / "p.nc")
     tree = arviz.from_netcdf(tmp_path / "p.nc")
     assert {"posterior", "prior_predictive", "posterior_predictive"} < set(tree.groups())
     draws = tree.posterior["k_L"].to_numpy()
     assert draws.shape == (1, 150)
-    assert np.mean(draws) == pytest.approx(output["k_L"].mean, rel=1e-6)
+    assert np.mean(draws) == pytest.approx(rows["k_L"].mean, rel=1e-6)
     with pytest.raises(psa.InputError, match="'nothing' is no parameter"):
         psa.sample(psa.stack_model(STACK), [record], free=["nothing"])

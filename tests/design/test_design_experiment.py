@@ -40,8 +40,7 @@ from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.units import FloatArray
 from tests.contract.helpers import done, refused
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import make_record
+from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow
 
 STACK = "P-885.51"

@@ -30,16 +30,16 @@ from psa_casadi.design.tracking.tracking import (
 )
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
 from tests.contract.helpers import done, refused
-from tests.export.fmu_models import exported
-from tests.studies.benchmarks.design_tracking import (
+from tests.design.scanned_stack import (
     LIMITS,
     bang_bang_bound,
+    bang_bang_move,
     creeping_displacement,
-    own_bang_bang,
     scan,
     scanner,
     wrong_values,
 )
+from tests.export.fmu_models import exported
 from tests.tiers import slow
 
 
@@ -121,7 +121,7 @@ def test_a_quickest_move_is_near_what_hysteresis_and_creep_allow() -> None:
     begin, end = 10e-6, 2e-6
     model = scanner(0.0)
     quick_move = quickest_move(model, begin, end, LIMITS)
-    value = own_bang_bang(model, quick_move)
+    value = bang_bang_move(model, quick_move)
     assert value is not None
     assert bang_bang_bound(model.values, begin, end, -20.0, 120.0) < value
     assert value < quick_move.move_time < 1.02 * value

@@ -21,8 +21,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, split
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.units import FloatArray
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import make_record
+from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow, slow_but
 
 SAMPLES, LEVEL = 2000, 2e-8

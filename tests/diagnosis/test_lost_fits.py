@@ -9,8 +9,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import make_record
+from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow
 
 

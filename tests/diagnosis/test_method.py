@@ -17,15 +17,15 @@ from tests.studies.benchmarks.ablation import (
     moved_constants,
     without_steps,
 )
-from tests.studies.benchmarks.hidden_cases import Case, Found
+from tests.studies.benchmarks.hidden_cases import Case, CaseResult
 
 NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 
 
-def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> Found:
+def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> CaseResult:
     case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
     verdict: Verdict = "cause_named" if named else "unexplained"
-    return Found(case, 1.0, verdict, named, named, (), 0.9, {}, {}, 1.0, 1.0)
+    return CaseResult(case, 1.0, verdict, named, named, (), {}, 1.0)
 
 
 def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
@@ -35,7 +35,7 @@ def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
     worse = [replace(f, named=("backlash",), within=("backlash",)) for f in whole[:3]]
     methods: list[Method] = []
 
-    def diagnosed(_: Sequence[Case], method: Method) -> list[Found]:
+    def diagnosed(_: Sequence[Case], method: Method) -> list[CaseResult]:
         methods.append(method)
         return [*worse, whole[3]] if "finite steps" in method.without else whole
 

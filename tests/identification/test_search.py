@@ -32,12 +32,12 @@ def test_a_stack_is_found_from_its_records_alone() -> None:
     assert run.converged
     assert run.rms_ratio == pytest.approx(1.0, abs=0.05)
     assert all(run.white)
-    table = {f.name: f for f in run.found if f.determined}
+    table = {q.name: q for q in run.determined}
     assert {"k_L", "A", "beta", "gamma", "delta", "n"} <= set(table)
     for name_of, limit in {"k_L": 0.01, "A": 0.01, "n": 0.05, "beta": 0.05}.items():
-        assert table[name_of].relative < limit, name_of
-    assert sum(not f.covered for f in table.values()) <= 2
-    assert all(abs(f.value - f.truth) < 4.5 * f.error for f in table.values())
+        assert table[name_of].value == pytest.approx(table[name_of].truth, rel=limit), name_of
+    assert sum(not q.covered for q in table.values()) <= 2
+    assert all(q.errors_off < 4.5 for q in table.values())
 
 
 def test_exchanging_twice_changes_nothing() -> None:

@@ -19,7 +19,7 @@ from psa_casadi.model.nanopositioner import (
 from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
-from tests.studies.benchmarks.nonlinearity import Controller, simulate_positioner
+from tests.model.plain_positioner import Controller, simulate_positioner
 from tests.tiers import slow
 
 STACK = "P-885.51"

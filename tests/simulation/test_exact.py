@@ -4,6 +4,7 @@ import ctypes
 import re
 from collections.abc import Iterator
 from functools import cache
+from importlib import resources
 
 import casadi as ca
 import numpy as np
@@ -13,9 +14,11 @@ from psa_casadi import reference
 from psa_casadi.component import Component, Equations
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.model.structure import structure_of
+from psa_casadi.records import read_record
 from psa_casadi.reference import Mechanics
 from psa_casadi.simulation import stepper
 from psa_casadi.simulation.compiler import (
@@ -27,7 +30,7 @@ from psa_casadi.simulation.compiler import (
 from psa_casadi.simulation.exact import run as exact
 from psa_casadi.simulation.exact.run import run_exact, why_not
 from psa_casadi.simulation.exact.split import Split, split_of
-from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, simulate
+from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, record_inputs, simulate
 from psa_casadi.simulation.start import start_on
 from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
@@ -51,7 +54,6 @@ from tests.simulation.exact_cases import (
     voltage,
     with_effect,
 )
-from tests.studies.benchmarks.fits import demonstration
 from tests.tiers import slow
 
 RTOL = 1e-6
@@ -211,11 +213,13 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
 
 def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
     """At the demonstration's kinks steps that were halved once where they err by far missed it."""
-    task = demonstration()
-    x0, _ = task.start(task.model)
+    with resources.as_file(resources.files("psa_casadi").joinpath("data", "demo.csv")) as path:
+        record = read_record(path)
+    model, t = starting_model([record]), np.asarray(record.time - record.time[0])
+    u = record_inputs(model, record, record.n)
+    x0 = start_on(model, t, u).x
     rough, fine = (
-        run_exact(task.model, task.time, task.inputs, x0, tolerance=q, outputs=(OUTPUT,)).shown
-        for q in (1e-5, 1e-8)
+        run_exact(model, t, u, x0, tolerance=q, outputs=(OUTPUT,)).shown for q in (1e-5, 1e-8)
     )
     assert np.max(np.abs(rough - fine)) <= 1e-5 * np.ptp(fine)
 

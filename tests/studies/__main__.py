@@ -31,7 +31,7 @@ def study(
         str | None, typer.Option(help="Pattern of the cases, where a benchmark has named ones.")
     ] = None,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Draw of fresh seeds; several may be given.")
+        list[int] | None, typer.Option(min=0, help="Draw of fresh seeds; may be repeated.")
     ] = None,
     quiet: Quiet = False,
 ) -> None:
@@ -67,7 +67,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 app.command(epilog="Example: python -m tests.studies identify --quick")(guarded(study))
 
 if __name__ == "__main__":
-    own = bench(sys.argv[1], "app") if sys.argv[1:] else None  # options of its own
-    if own is not None:
-        own(sys.argv[2:], prog_name=f"python -m tests.studies {sys.argv[1]}")
+    command = bench(sys.argv[1], "app") if sys.argv[1:] else None  # with further options
+    if command is not None:
+        command(sys.argv[2:], prog_name=f"python -m tests.studies {sys.argv[1]}")
     app(prog_name="python -m tests.studies")

@@ -15,8 +15,8 @@ from tests.studies.benchmarks.causes import data as writing
 from tests.studies.benchmarks.causes.data import cases_of
 from tests.tiers import slow
 
-OWN = Path(writing.__file__).parent
-SCORE = OWN / "score.py"
+DATA = Path(writing.__file__).parent
+SCORE = DATA / "score.py"
 #: Alone: no folder of ours on the path; numpy's is added by hand.
 ALONE = "import sys, runpy; sys.path.append(sys.argv.pop(1)); sys.argv.pop(0);" \
     " runpy.run_path(sys.argv[0], run_name='__main__')"  # fmt: skip
@@ -60,7 +60,7 @@ def data(tmp_path: Path) -> Path:
 def give(data: Path, name: str, causes: list[dict[str, float]], **more: Any) -> None:
     content = {"format": "psa_causes.answer/1", "case": name, "detected": bool(causes)}
     content |= {"causes": causes, **more}
-    schema = json.loads((OWN / "answer.schema.json").read_text("utf-8"))
+    schema = json.loads((DATA / "answer.schema.json").read_text("utf-8"))
     jsonschema.Draft202012Validator(schema).validate(content)
     put(data.parent / "answers" / f"{name}.json", content)
 

@@ -1,6 +1,6 @@
 """Damaged inputs, kills and hostile surroundings: short runs; the long one is a benchmark.
 
-`python -m tests.studies fuzz --help` says how; docs/evidence.md what was measured.
+`python -m tests.studies fuzz --help` lists the options of longer runs.
 """
 
 import json
@@ -27,7 +27,7 @@ if not hasattr(os, "fork"):
 
 from tests.studies.benchmarks.fuzz import TARGETS, app, tables
 from tests.studies.fuzz import campaign, readers
-from tests.studies.fuzz.campaign import Found, Tally, Target, generator, replay, run
+from tests.studies.fuzz.campaign import Finding, Tally, Target, generator, replay, run
 from tests.studies.fuzz.damage import damaged_bytes, damaged_json, damaged_table
 
 #: Inputs of each target in the quick tier, and in the full one.
@@ -92,8 +92,8 @@ def test_any_text_is_a_unit_or_is_refused(text: str) -> None:
     assert unit.ratio > 0
 
 
-def _behaviour(data: bytes, folder: Path) -> Iterator[Found]:
-    """Do what the input says."""
+def _behaviour(data: bytes, folder: Path) -> Iterator[Finding]:
+    """Behave as the input demands."""
     match data.decode():
         case "refuse":
             raise InputError("no.")
@@ -106,7 +106,7 @@ def _behaviour(data: bytes, folder: Path) -> Iterator[Found]:
         case "foreign":
             raise KeyError("x")
         case "false pass":
-            yield Found(campaign.FALSE_PASS, "it passes")
+            yield Finding(campaign.FALSE_PASS, "it passes")
         case "left over":
             (folder.parent / "tmp" / "left").touch()
         case "memory" if sys.platform.startswith("linux"):

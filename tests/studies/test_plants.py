@@ -1,5 +1,6 @@
 """The independent plants: their numerics and their physics are what they claim."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -8,19 +9,28 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from psa_casadi.cli.demo import HIDDEN
-from psa_casadi.units import FloatArray
 from tests.studies.plants.base import (
     SUB_INTERVALS,
     Run,
+    first_order,
+    follow,
     simulate_base,
 )
 from tests.studies.plants.effect import HiddenEffect
-from tests.studies.plants.excitations import draw_voltage
-from tests.studies.plants.hide import RATIO
+from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_voltage
+from tests.studies.plants.hide import (
+    RATIO,
+    Effect,
+    added_by,
+    base_directions,
+    effect_called,
+    refitted_ratio,
+    visible_ratio,
+)
 from tests.studies.plants.make import HEADER, make_demo, make_record
-from tests.studies.plants.stack import Stack, draw_stack
+from tests.studies.plants.stack import FloatArray, Stack, draw_stack
 from tests.studies.plants.table import HIDDEN_EFFECTS
-from tests.tiers import slow_but
+from tests.tiers import slow, slow_but
 
 CONVERGENCE = 2e-5
 """Largest change of the displacement over its range when the grid is refined by 4."""
@@ -136,12 +146,12 @@ def test_effect_vanishes_at_gain_zero_and_adds_what_it_did(effect: HiddenEffect,
     slow_but([EFFECTS[0]], [EFFECTS[0], *(e for e in EFFECTS if e.room is not None), None]),
     ids=lambda e: e.name if e else "none",
 )
-def test_strength_zero_is_the_clean_record(
+def test_a_gain_of_zero_is_the_clean_record(
     effect: HiddenEffect | None, clean_lines: list[str], tmp_path: Path
 ) -> None:
     """One effect, those that need a thermometer, and none; the test above has all of them."""
     name = None if effect is None else effect.name
-    truth = make_record(name, 11, tmp_path / "effect.csv", strength=0.0)
+    truth = make_record(name, 11, tmp_path / "effect.csv", gain=0.0)
     assert np.array_equal(truth.displacement, truth.base_displacement)
     lines = (tmp_path / "effect.csv").read_text(encoding="utf-8").splitlines()
     if truth.temperature is not None:
@@ -172,3 +182,112 @@ def test_demo_fits_its_size(tmp_path: Path) -> None:
     assert (tmp_path / "demo.csv").stat().st_size < 300_000
     assert f"{100 * truth.gain:.1f} % of the elongation for each decade" in HIDDEN
     assert f"from {truth.parameters['t_0']:.2f} s on" in HIDDEN
+
+
+@pytest.mark.parametrize("kind", slow_but(["rich", "bipolar", "small"], EXCITATIONS))
+def test_every_voltage_starts_at_rest_and_stays_in_its_span(
+    kind: ExcitationKind, tmp_path: Path
+) -> None:
+    truth = make_record(None, 2, tmp_path / "a.csv", excitation=kind)
+    rich = make_record(None, 2, tmp_path / "b.csv")
+    assert truth.stack == rich.stack
+    assert truth.voltage[0] == truth.voltage[1] == 0.0
+    span, top = truth.stack.u_rated, truth.voltage.max()
+    assert -span <= truth.voltage.min() <= (-0.1 * span if kind == "bipolar" else 0.0)
+    least, most = (0.03, 0.4) if kind == "small" else (0.55, 1.0)
+    assert least * span < top <= most * span
+    assert np.all(np.isfinite(truth.displacement))
+    assert (truth.times[-1] > 240.0) == (kind == "slow")
+    assert (np.array_equal(truth.voltage, rich.voltage)) == (kind == "rich")
+
+
+@pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "backlash"]))
+def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> None:
+    truth = make_record(effect, 4, tmp_path / "a.csv", visible=0.4)
+    assert truth.visible == pytest.approx(0.4, rel=0.05)
+    assert not truth.gain_limited
+    drawn = make_record(effect, 4, tmp_path / "a.csv", visible=(0.8, 1.2))
+    assert 0.75 <= drawn.visible <= 1.25
+    huge = make_record(effect, 4, tmp_path / "a.csv", visible=1e4)
+    assert huge.gain_limited
+    assert huge.visible < 1e4
+
+
+@slow
+def test_a_pole_before_the_drive_vanishes_in_a_fit(tmp_path: Path) -> None:
+    """Why a lag is scaled by a base that is fitted again: its linearisation cannot see this."""
+    truth = make_record(None, 1, tmp_path / "a.csv")
+    run = simulate_base(truth.stack, truth.times[:2000], truth.voltage[:2000], 12)
+    late = first_order(-1.0 / 2e-3 + 0j, run.fine_command, run.fine_step).real / 2e-3
+    added = follow(run, late).displacement - run.displacement
+    assert visible_ratio(base_directions(run), added, truth.sigma) > 1.0
+    assert refitted_ratio(run, added, truth.sigma) < 0.5
+
+
+_RATE, _FREQUENCY = 1000.0, 20.0
+_LAG, _DELAY, _DRIVE, _ZETA = 4e-3, 2.5e-3, 3e-3, 0.8
+
+
+@pytest.fixture(scope="module")
+def linear() -> Run:
+    """A stack without hysteresis, driven by a sine of 20 Hz for half a second."""
+    stack = replace(draw_stack(np.random.default_rng(3)), a=0.0, beta=0.0, gamma=0.0, delta=0.0)
+    times = np.arange(501) / _RATE
+    return simulate_base(stack, times, 20.0 * np.sin(2.0 * np.pi * _FREQUENCY * times), 24)
+
+
+def _amplitude(run: Run, signal: FloatArray) -> complex:
+    """Complex amplitude of the last five periods at the drive's frequency [m]."""
+    last = slice(-250, None)
+    turn = np.exp(-2j * np.pi * _FREQUENCY * run.times[last])
+    return complex(2.0 * np.mean(signal[last] * turn))
+
+
+def _effect(name: str, gain: float, **parameters: float) -> Effect:
+    return effect_called(name), parameters, gain
+
+
+def test_lags_of_a_linear_stack_multiply(linear: Run) -> None:
+    """Reference: the product of the transfer functions, by hand."""
+    chain = [
+        _effect("sensor_delay", _DELAY),
+        _effect("sensor_lag", _LAG),
+        _effect("drive_lag", _DRIVE, zeta=_ZETA),
+    ]
+    s = 2j * np.pi * _FREQUENCY
+    expected = np.exp(-s * _DELAY) / (1.0 + s * _LAG)
+    expected /= 1.0 + 2.0 * _ZETA * s * _DRIVE + (s * _DRIVE) ** 2
+    moved = linear.displacement + added_by(linear, chain)
+    result = _amplitude(linear, moved) / _amplitude(linear, linear.displacement)
+    assert result == pytest.approx(expected, abs=2e-3)
+    summed = linear.displacement + sum(e.contribution(linear, p, g) for e, p, g in chain)
+    apart = _amplitude(linear, summed) / _amplitude(linear, linear.displacement)
+    assert abs(apart - expected) > 0.2
+
+
+def test_a_sensor_reads_what_the_stack_adds(linear: Run) -> None:
+    """A sensor's step of the converter lies where the whole displacement passes its place."""
+    place = 0.5 * float(linear.displacement.max())
+    heights = {"mid": place, "quarter": 1.0, "next": 0.0}
+    contact = _effect("preload_loss", 0.5, x_0=0.0, side=1.0)
+    total = added_by(linear, [_effect("converter_step", 1e-7, **heights), contact])
+    moved = linear.displacement + added_by(linear, [contact])
+    assert np.allclose(total - added_by(linear, [contact]), 1e-7 * (moved > place), atol=1e-18)
+
+
+def test_one_effect_and_none_are_as_without_others(linear: Run) -> None:
+    effect, parameters, gain = _effect("charge_leakage", 0.1, t=0.2)
+    alone = effect.contribution(linear, parameters, gain)
+    assert np.array_equal(added_by(linear, [(effect, parameters, gain)]), alone)
+    none = [_effect("drive_lag", 0.0, zeta=_ZETA), _effect("sensor_lag", 0.0)]
+    assert not np.any(added_by(linear, none))
+    assert not np.any(added_by(linear, []))
+
+
+def test_two_drives_are_one_after_the_other(linear: Run) -> None:
+    """A stack limited to a rate by its amplifier, with a slower command: the limit does nothing."""
+    limit = _effect("current_limit", 1.0 / 2000.0)
+    assert np.any(np.abs(added_by(linear, [limit])) > 1e-8)
+    slow = _effect("drive_lag", 15e-3, zeta=_ZETA)
+    both, only = added_by(linear, [slow, limit]), added_by(linear, [slow])
+    assert np.allclose(both[100:], only[100:], atol=1e-11)

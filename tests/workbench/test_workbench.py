@@ -22,7 +22,7 @@ from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
 from psa_casadi.workbench.subject import Subject
-from tests.contract.test_commands import asked
+from tests.contract.test_commands import request
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
 
@@ -45,7 +45,7 @@ class Tab:
     ) -> tuple[int, dict[str, str], bytes]:
         data = body if isinstance(body, bytes | None) else json.dumps(body).encode()
         sent = {n: v for n, v in {**self.headers(method), **headers}.items() if v}
-        return asked(f"127.0.0.1:{self.port}", method, path, data, **sent)
+        return request(f"127.0.0.1:{self.port}", method, path, data, **sent)
 
     def enter(self) -> "Tab":
         status, headers, _ = self.ask("GET", f"/?token={self.server.token}")

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from psa_casadi.diagnosis.task import STEPS, Method, Thresholds
-from tests.studies.benchmarks.hidden_cases import Case, Found, diagnosed, study
+from tests.studies.benchmarks.hidden_cases import Case, CaseResult, diagnosed, study
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.studies.plants.table import FOREIGN, KNOWN
 
@@ -21,7 +21,7 @@ _FASTEST = 15
 #: Of a study with one seed for each effect every so manyth case of a kind is repeated.
 _EVERY = {"known": 2, "weak": 4, "clean": 2, "ringing": 1, "foreign": 2, "left out": 3, "two": 1}
 #: Diagnoses cases by a method.
-Diagnosed = Callable[[Sequence[Case], Method], Sequence[Found]]
+Diagnosed = Callable[[Sequence[Case], Method], Sequence[CaseResult]]
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
@@ -30,7 +30,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     `quick` takes half of the cases for the steps, and of these the fastest for the constants.
     """
 
-    def ask(cases: Sequence[Case], method: Method) -> Sequence[Found]:
+    def ask(cases: Sequence[Case], method: Method) -> Sequence[CaseResult]:
         return diagnosed(cases, progress, method)
 
     whole, steps = ask(chosen_cases(2 if quick else 1), Method()), without_steps()
@@ -77,30 +77,27 @@ def moved_constants() -> dict[str, Method]:
     return moved
 
 
-def several_table(found: Mapping[str, Sequence[Found]]) -> TitledTable:
-    """Return what the method and the search one by one say of several causes at once."""
+def several_table(results: Mapping[str, Sequence[CaseResult]]) -> TitledTable:
+    """Return how often each method names several causes."""
     rows = []
-    for name, of in found.items():
-        items = [f for f in of if f.reached]
-        ratios = [f.ratio for f in items]
+    for name, of in results.items():
+        reached = [f for f in of if f.reached]
         rows.append({
             "method": name,
-            "all in the sets": share(set(f.case.hidden) <= set(f.within) for f in items),
-            "all named, no other": share(set(f.named) == set(f.case.hidden) for f in items),
-            "held-out rms over the noise's: mean, largest": f"{np.mean(ratios):.3f},"
-            f" {max(ratios):.2f}",
-            "s each": f"{np.mean([f.seconds for f in items]):.0f}",
+            "all in the sets": share(f.in_set for f in reached),
+            "all named, no other": share(set(f.named) == set(f.case.hidden) for f in reached),
+            "s each": f"{np.mean([f.seconds for f in reached]):.0f}",
         })  # fmt: skip
     return TitledTable("Two and three causes", rows)
 
 
 def ablation_table(
-    title: str, methods: Mapping[str, Method], whole: Sequence[Found], ask: Diagnosed
+    title: str, methods: Mapping[str, Method], whole: Sequence[CaseResult], ask: Diagnosed
 ) -> TitledTable:
-    """Return what each method says of the cases beside the whole method."""
-    rows = [_said("the method", whole, whole)]
+    """Return the answers of each method to the cases, and how many differ from the whole method."""
+    rows = [_row("the method", whole, whole)]
     for name, method in methods.items():
-        rows.append(_said(name, ask([f.case for f in whole], method), whole))
+        rows.append(_row(name, ask([f.case for f in whole], method), whole))
     return TitledTable(
         title,
         rows,
@@ -110,26 +107,26 @@ def ablation_table(
     )
 
 
-def _said(name: str, found: Sequence[Found], whole: Sequence[Found]) -> dict[str, str]:
-    def of(*kinds: str) -> list[Found]:
-        return [f for f in found if f.case.kind in kinds]
+def _row(name: str, results: Sequence[CaseResult], whole: Sequence[CaseResult]) -> dict[str, str]:
+    def of(*kinds: str) -> list[CaseResult]:
+        return [f for f in results if f.case.kind in kinds]
 
-    def count(holds: Callable[[Found], bool], founds: Sequence[Found]) -> str:
-        return f"{sum(map(holds, founds))} of {len(founds)}"
+    def count(holds: Callable[[CaseResult], bool], cases: Sequence[CaseResult]) -> str:
+        return f"{sum(map(holds, cases))} of {len(cases)}"
 
-    items = [f for f in of("known", "weak", "two") if f.reached]
+    known = [f for f in of("known", "weak", "two") if f.reached]
     absent = [f.patched for f in of("foreign", "left out") if f.verdict == "unexplained"]
-    other = [
+    changed = sum(
         a.verdict != b.verdict or set(a.within) != set(b.within)
-        for a, b in zip(whole, found, strict=True)
-    ]
+        for a, b in zip(whole, results, strict=True)
+    )
     return {
         "method": name,
-        "right in the set": count(lambda f: set(f.case.hidden) <= set(f.within), items),
-        "right alone": count(lambda f: f.right_alone, items),
-        "wrong alone": count(lambda f: f.alone not in (None, *f.case.hidden), found),
+        "right in the set": count(lambda f: f.in_set, known),
+        "right alone": count(lambda f: f.right_alone, known),
+        "wrong alone": count(lambda f: f.wrong_alone, results),
         "clean named": count(lambda f: bool(f.named), of("clean", "ringing")),
         "port of the patch removes": f"{100.0 * np.median(absent or [0.0]):.0f} % of {len(absent)}",
-        "s each": f"{np.mean([f.seconds for f in found]):.1f}",
-        "verdicts changed": "" if name == "the method" else f"{sum(other)} of {len(whole)}",
+        "s each": f"{np.mean([f.seconds for f in results]):.1f}",
+        "verdicts changed": "" if name == "the method" else f"{changed} of {len(whole)}",
     }

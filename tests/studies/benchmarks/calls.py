@@ -27,20 +27,20 @@ _VARIABLE = "FMU_CALLS"
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Log the calls of every importer that is there."""
-    tables, observed = [], list[Row]()
+    tables, summary = [], list[Row]()
     for name, importer in _IMPORTERS.items():
         progress(name)
         lines = _logged(name, importer)
         if not lines:
-            observed.append({"importer": name} | dict.fromkeys(_HEADS, "not installed"))
+            summary.append({"importer": name} | dict.fromkeys(_HEADS, "not installed"))
             continue
         if len(lines) == 1:
-            observed.append({"importer": name} | dict.fromkeys(_HEADS, "-") | {"read": lines[0]})
+            summary.append({"importer": name} | dict.fromkeys(_HEADS, "-") | {"read": lines[0]})
             continue
-        observed.append({"importer": name, **_told(lines)})
+        summary.append({"importer": name, **_values_by_phase(lines)})
         rows = [{"call": line} for line in _shortened(lines)]
         tables.append(TitledTable(name, rows))
-    what = TitledTable("The input u = t in the step from 0.1 s to 0.2 s", observed)
+    what = TitledTable("The input u = t in the step from 0.1 s to 0.2 s", summary)
     return Outcome([what] if quick else [what, *tables])
 
 
@@ -62,7 +62,7 @@ def _logged(name: str, importer: Callable[[Path], None]) -> list[str]:
 _HEADS = ("before initialization", "in it", "in the step", "read")
 
 
-def _told(lines: list[str]) -> Row:
+def _values_by_phase(lines: list[str]) -> Row:
     """Return which values of u there are before, in and after initialization, and in the step."""
     enter, leave = (lines.index(f"{w}InitializationMode") for w in ("Enter", "Exit"))
     after = lines[leave:]
@@ -76,8 +76,8 @@ def _told(lines: list[str]) -> Row:
     else:
         times = [k for k, w in enumerate(after) if w == "SetTime 0.1"]
         ends = [k for k, w in enumerate(after) if w == "SetTime 0.2"]
-        items = [w for w in after[times[-1] : ends[0]] if w.startswith("GetDer")]
-        in_step, read = list(dict.fromkeys(items)), []
+        rates = [w for w in after[times[-1] : ends[0]] if w.startswith("GetDer")]
+        in_step, read = list(dict.fromkeys(rates)), []
     of = {"before initialization": lines[:enter], "in it": lines[enter:leave]}
     return {
         **{k: _join([w for w in part if w.startswith("Set u")]) for k, part in of.items()},

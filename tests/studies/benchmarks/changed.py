@@ -1,4 +1,4 @@
-"""Records changed a little or a lot: by 1 % of their noise, by an effect on top, cut and spoilt."""
+"""Changed records: by 1 % of their noise, by an added effect, cut and spoilt."""
 
 import itertools
 import tempfile
@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from time import process_time
 from typing import NamedTuple
 
 import numpy as np
@@ -17,15 +16,21 @@ from psa_casadi.records.drive import reversals
 from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.studies.benchmarks.records import noisy
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share
+from tests.studies.benchmarks.table import (
+    Outcome,
+    Progress,
+    Row,
+    TitledTable,
+    on_all_cores,
+    share,
+)
 from tests.studies.exam.play import write
 from tests.studies.exam.record import Record as ExamRecord
 from tests.studies.exam.records import RECORDS
 from tests.studies.plants.base import simulate_base
-from tests.studies.plants.hide import hide
+from tests.studies.plants.hide import base_directions, hide
 from tests.studies.plants.stack import draw_stack
 from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
-from tests.studies.plants.visibility import base_directions
 
 #: The first of the seeds of `stability`, which no other benchmark uses; the change of the data over
 #: the rms of their noise; that of the measured records [m].
@@ -34,17 +39,17 @@ FIRST, CHANGE, _MEASURED_NOISE = 480201, 0.01, 67e-9
 #: one of so many, and of measured rows.
 CASES, DRAWS, EXAM_DRAWS, QUICK_EXAM, MEASURED_DRAWS = 40, 20, 3, 12, 9
 _KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "design", "ringing")
-#: Rows of `docs/evidence.md`.
+#: Measured records.
 MEASURED = ("sine_1hz", "minor_loops", "both files")
 
-#: A case of the study, a record of the exam, or a row of the measured ones; and what was said of
-#: it: verdict, names, and the whole set.
+#: A case of the study, a record of the exam, or a row of the measured ones.
 Source = Case | ExamRecord | str
-Said = tuple[str, frozenset[str], frozenset[str]]
+#: Verdict, names, and names with those that cannot be distinguished from them.
+Answered = tuple[str, frozenset[str], frozenset[str]]
 
 
 def stability(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose everything as it is, then with white noise of 1 % of its own added."""
+    """Diagnose everything as it is, then with added white noise of 1 % of its noise."""
     jobs: list[tuple[str, Source, int]] = [
         (c.kind, c, 3 if quick else DRAWS) for c in chosen_cases(6 if quick else CASES)
     ]
@@ -52,24 +57,20 @@ def stability(progress: Progress, quick: bool) -> Outcome:
     jobs += [("exam", record, 1 if quick else EXAM_DRAWS) for record in exam]
     jobs += [("measured", row, 1 if quick else MEASURED_DRAWS) for row in MEASURED]
     draws = [(source, k) for _, source, n in jobs for k in range(n + 1)]
-    output = lambda s: f"{s[0]} {', '.join(s[1])}"  # noqa: E731
-    statement = iter(on_all_cores(said_of, draws, progress, output))
-    table = {
-        (kind, k): list(itertools.islice(statement, n + 1)) for k, (kind, _, n) in enumerate(jobs)
-    }
+    answers = iter(on_all_cores(answer_of, draws, progress, lambda a: f"{a[0]} {', '.join(a[1])}"))
+    by_case = [(kind, list(itertools.islice(answers, n + 1))) for kind, _, n in jobs]
     rows = []
-    for kind in (*dict.fromkeys(kind for kind, _ in table), "all"):
-        items = [of for (name, _), of in table.items() if kind in (name, "all")]
-        pairs = [(first, s) for first, *changed in items for s in changed]
+    for kind in (*dict.fromkeys(kind for kind, _ in by_case), "all"):
+        cases = [draws for name, draws in by_case if kind in (name, "all")]
+        pairs = [(first, other) for first, *others in cases for other in others]
         rows.append({
-            "cases": kind, "number": len(items),
-            "same verdict and names": share(s[:2] == first[:2] for first, s in pairs),
+            "cases": kind, "number": len(cases),
+            "same verdict and names": share(a[:2] == b[:2] for a, b in pairs),
             "same verdict, names in the set": share(
-                s[0] == first[0] and first[1] <= s[2] for first, s in pairs
+                a[0] == b[0] and a[1] <= b[2] for a, b in pairs
             ),
-            "cases without a change": sum(len({s[:2] for s in of}) == 1 for of in items),
         })  # fmt: skip
-    note = "Everything is diagnosed as it is, and with white noise of 1 % of its own added."
+    note = "Everything is diagnosed as it is, and with added white noise of 1 % of its noise."
     return Outcome([TitledTable("Data changed by 1 % of their noise", rows, note)])
 
 
@@ -78,12 +79,12 @@ def chosen_cases(count: int) -> list[Case]:
     every = study(KNOWN, FOREIGN, 2, FIRST)
     rows = [[c for c in every if c.kind == kind] for kind in _KINDS]
     each = -(-count // len(rows))
-    spread = [[item[len(item) * k // each] for k in range(each)] for item in rows]
-    return [item[k] for k in range(each) for item in spread][:count]
+    spread = [[of[len(of) * k // each] for k in range(each)] for of in rows]
+    return [of[k] for k in range(each) for of in spread][:count]
 
 
-def said_of(source: Source, draw: int) -> Said:
-    """Return what is said of records with their readings changed by white noise; draw 0 is not."""
+def answer_of(source: Source, draw: int) -> Answered:
+    """Diagnose records with white noise added to their readings; draw 0 adds none."""
     noise, records = _records(source)
     seed = MEASURED.index(source) if isinstance(source, str) else source.seed
     rng, level = np.random.default_rng([seed, draw]), CHANGE * noise if draw else 0.0
@@ -113,7 +114,7 @@ FIRST_ADDED, LENGTH, EXCERPTS = 620401, 2400, 2
 #: Rms of what is added and the base cannot absorb, over what the extended model of the record as it
 #: was measured leaves.
 SIZE = 3.0
-#: Samples in which the plant's voltage rises from zero to where an excerpt begins.
+#: Samples in which the plant's voltage rises from zero to the start of an excerpt.
 _LEAD = 400
 
 
@@ -123,72 +124,59 @@ TUNED = 3
 _FEWEST = 400
 
 
-class Named(NamedTuple):
-    """What was said: the verdict, the names, and these with what they cannot be told from."""
+class Answer(NamedTuple):
+    """A verdict, the names, and these with those that cannot be distinguished from them."""
 
     verdict: str
     named: tuple[str, ...]
     within: tuple[str, ...]
 
-    def wrong(self, right: Sequence[str]) -> tuple[str, ...]:
-        """Return the names that are not right."""
-        return tuple(n for n in self.named if n not in right)
-
-    def alone(self, right: Sequence[str]) -> bool:
-        """Whether one wrong cause is named as the only one, with nothing left."""
-        single = self.verdict == "cause_named" and len(self.named) == 1
-        return single and self.named == self.wrong(right)
-
 
 class Added(NamedTuple):
-    """What was said of an excerpt as it was measured, and with an effect on top.
+    """A record with an added effect: the names without the effect, and the answers with it.
 
-    `own` are the names and their sets without the effect. `said` is what was said with it: without
-    a reference, against what else was recorded of the device, against the same test recorded again.
+    The answers are without a reference, with the other records of the device as reference, and with
+    the same test as reference.
     """
 
     record: str
     effect: str
-    own: tuple[str, ...]
-    said: tuple[Named, Named, Named]
+    before: tuple[str, ...]
+    answers: tuple[Answer, Answer, Answer]
 
 
 def added(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose excerpts of the measured records as they are and with every effect on top.
+    """Diagnose excerpts of the measured records as they are and with every effect added.
 
-    A plant plays the record's own voltage with the effect and without it; the difference, scaled to
-    the record's stroke, is added to what was measured. What the record has by itself stays; with a
-    reference it is known. And records of the same healthy device against each other: nothing has
-    changed there.
+    A plant plays the record's voltage with the effect and without it; the difference, scaled to
+    the record's stroke, is added to the measurement. Records of the same healthy device are
+    diagnosed against each other, too: nothing has changed there.
     """
     effects = [e for e in KNOWN if HIDDEN_EFFECTS[e].room is None][:: 5 if quick else 1]
     pieces = excerpts_from_reversals(1 if quick else EXCERPTS)[: 1 if quick else None]
     plain = on_all_cores(by_itself, [(p,) for p, _ in pieces], progress)
     jobs = [
-        (piece, others, effect, FIRST_ADDED + 100 * k + j, *item)
-        for k, ((piece, others), item) in enumerate(zip(pieces, plain, strict=True))
+        (piece, others, effect, FIRST_ADDED + 100 * k + j, *alone)
+        for k, ((piece, others), alone) in enumerate(zip(pieces, plain, strict=True))
         for j, effect in enumerate(effects)
     ]
     result = on_all_cores(with_effect, jobs, progress, lambda f: f"{f.record} with {f.effect}")
     each = [
-        {"record": f.record, "named by itself": ", ".join(f.own) or "-", "added": f.effect,
-         **{how: f"{s.verdict}: {', '.join(s.within) or '-'}"
-            for how, s in zip(_WAYS, f.said, strict=True)}}
+        {"record": f.record, "named by itself": ", ".join(f.before) or "-", "added": f.effect,
+         **{way: f"{a.verdict}: {', '.join(a.within) or '-'}"
+            for way, a in zip(_WAYS, f.answers, strict=True)}}
         for f in result
     ]  # fmt: skip
     kept = [f for k, f in enumerate(result) if k % TUNED] if not quick else result
     pairs = on_all_cores(unchanged, _pairs(quick), progress, lambda f: str(f["record"]))
-    titled_table = TitledTable(
-        "Records of the same healthy device: nothing has changed", pairs,
-        "A wrong name is any name. Measured records, and halves of the clean records of the exam.",
-    )  # fmt: skip
-    return Outcome((summary(kept), titled_table, TitledTable("What was said of each", each)))
+    healthy = TitledTable("Records of the same healthy device: nothing has changed", pairs)
+    return Outcome((summary(kept), healthy, TitledTable("Each answer", each)))
 
 
 def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Record, ...]]]:
     """Return excerpts of the measured records, each from a reversal on, and what else there is."""
     rng = np.random.default_rng(FIRST_ADDED)
-    items = []
+    pieces = []
     for record in datasets.micromanipulator():
         turns = [t for t in reversals(record.voltage) if t + LENGTH <= record.n]
         for start in np.sort(rng.choice(turns, each, replace=False)).tolist():
@@ -196,8 +184,8 @@ def excerpts_from_reversals(each: int) -> list[tuple[psa.Record, tuple[psa.Recor
             parts = ((0, start), (start + LENGTH, record.n))
             others = tuple(record.slice(a, b) for a, b in parts if b - a >= _FEWEST)
             name = f"{record.name} from {record.time[start]:.1f} s"
-            items.append((replace(piece, name=name), others))
-    return items
+            pieces.append((replace(piece, name=name), others))
+    return pieces
 
 
 def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
@@ -208,37 +196,37 @@ def by_itself(record: psa.Record) -> tuple[tuple[str, ...], float]:
 
 def with_effect(
     record: psa.Record, others: Sequence[psa.Record], effect: str, seed: int,
-    texts: tuple[str, ...], left: float,
+    before: tuple[str, ...], left: float,
 ) -> Added:  # fmt: skip
-    """Diagnose a record with an effect on top of what it has by itself, without a reference and so.
+    """Diagnose a record with an added effect, without a reference and with two.
 
-    The same test again is the record as it was measured with as much noise anew.
+    The same test again is the record as it was measured with fresh noise.
     """
     more = difference(record, effect, seed, SIZE * left)
     again = noisy(record, _MEASURED_NOISE, np.random.default_rng([seed // 100, 1]))
     new = replace(record, displacement=np.asarray(record.displacement) + more)
     every = (psa.diagnose([new], reference=sound) for sound in ((), others, [again]))
-    without, other, same = (Named(d.verdict, *names_of(d)) for d in every)
-    return Added(record.name, effect, texts, (without, other, same))
+    without, other, same = (Answer(d.verdict, *names_of(d)) for d in every)
+    return Added(record.name, effect, before, (without, other, same))
 
 
 def _pairs(quick: bool) -> list[tuple[str, psa.Record, psa.Record]]:
     """Return pairs of records of the same healthy device, of which the second is the reference."""
     sine, loops = datasets.micromanipulator()
     cuts = [sine.slice(k, k + 1500) for k in range(0, sine.n - 1500, 1500)]
-    items = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
-    items += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
+    pairs = [(f"{a.name} against {b.name}", a, b) for a, b in itertools.permutations(cuts, 2)]
+    pairs += [(f"{a.name} against {b.name}", a, b) for a, b in ((sine, loops), (loops, sine))]
     for record in RECORDS:
         if record.question.group == "clean":
             (whole,) = _records(record)[1]
             first, second = whole.slice(0, whole.n // 2), whole.slice(whole.n // 2, whole.n)
-            items.append((f"{record.name}, first half", first, second))
-            items.append((f"{record.name}, second half", second, first))
-    return items[::12] if quick else items
+            pairs.append((f"{record.name}, first half", first, second))
+            pairs.append((f"{record.name}, second half", second, first))
+    return pairs[::12] if quick else pairs
 
 
 def unchanged(name: str, new: psa.Record, reference: psa.Record) -> dict[str, object]:
-    """Diagnose a record against another one of the same device; a row of what is said."""
+    """Diagnose a record against another one of the same device; return a row of the answer."""
     try:
         d = psa.diagnose([new], reference=[reference])
     except psa.InputError:
@@ -260,74 +248,69 @@ def difference(record: psa.Record, effect: str, seed: int, size: float) -> Float
     times: FloatArray = record.sample_time * np.arange(played.size, dtype=np.float64)
     run = simulate_base(stack, times, played)
     scale = record.range_m / float(np.ptp(run.displacement[_LEAD:]))
-    hidden = hide(
-        HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, 1.0, visible=1.0
-    )
+    hidden = hide(HIDDEN_EFFECTS[effect], run, rng, base_directions(run), size / scale, visible=1.0)
     return np.asarray(scale * hidden.added[_LEAD:], dtype=np.float64)
 
 
-#: What is known beside the record.
+#: References.
 _WAYS = ("without a reference", "other records", "the same test again")
 
 
-def summary(found: Sequence[Added]) -> TitledTable:
-    """Return how often the effect is named, and how often another one that is not there."""
-    new = [f for f in found if called(f.effect) not in f.own]
+def summary(cases: Sequence[Added]) -> TitledTable:
+    """Return how often the effect is named, and how often one that is not there."""
+    new = [f for f in cases if called(f.effect) not in f.before]
 
-    def row(figure: str, text: str, of: Callable[[Added, Named], bool]) -> dict[str, object]:
-        ways = {how: share([of(f, f.said[k]) for f in new]) for k, how in enumerate(_WAYS)}
-        return {"figure": figure, "asked": text, **ways}
+    def row(figure: str, target: str, holds: Callable[[Added, int], bool]) -> Row:
+        shares = {way: share(holds(f, k) for f in new) for k, way in enumerate(_WAYS)}
+        return {"figure": figure, "asked": target, **shares}
 
-    def right(f: Added, s: Named) -> tuple[str, ...]:
-        return (called(f.effect), *(f.own if s is f.said[0] else ()))
+    def wrong(f: Added, way: int) -> set[str]:
+        """Return the wrong names; without a reference the record's own causes are right too."""
+        return {*f.answers[way].named} - {called(f.effect), *(() if way else f.before)}
+
+    def single_wrong(f: Added, way: int) -> bool:
+        a = f.answers[way]
+        return a.verdict == "cause_named" and len(a.named) == len(wrong(f, way)) == 1
 
     return TitledTable(
         "An effect added to a measured record",
         [
-            row("the effect in a named set", "70 of 87", lambda f, s: called(f.effect) in s.within),
-            row("a single wrong name", "at most 2 %", lambda f, s: s.alone(right(f, s))),
-            row("any cause that is not there", "-", lambda f, s: bool(s.wrong(right(f, s)))),
-            row("said to be as it was", "-", lambda f, s: s.verdict == "adequate"),
+            row(
+                "the effect in a named set",
+                "70 of 87",
+                lambda f, k: called(f.effect) in f.answers[k].within,
+            ),
+            row("a single wrong name", "at most 2 %", single_wrong),
+            row("any cause that is not there", "-", lambda f, k: bool(wrong(f, k))),
+            row("said to be as it was", "-", lambda f, k: f.answers[k].verdict == "adequate"),
         ],
-        f"{len(found) - len(new)} of {len(found)} effects are named of the record by itself and do"
-        f" not count. What is added is {SIZE:g} times what the extended model of the record leaves,"
-        f" beside what the base can absorb. Every {TUNED}rd case, on which the constants were"
-        " chosen, is not counted.",
+        f"{len(cases) - len(new)} of {len(cases)} effects are named in the record without them and"
+        f" do not count. The added rms, beside what the base can absorb, is {SIZE:g} times the"
+        f" residual of the record's extended model. Every {TUNED}rd case, on which the constants"
+        " were chosen, is not counted.",
     )
 
 
 #: The seed of `excerpts`, which no other benchmark uses; pieces; their samples.
 SEED, PIECES, QUICK_PIECES, LENGTHS = 740501, 200, 6, (300, 2500)
 #: Scales of the displacement, units mistaken by a power of ten among them; every so many samples
-#: are kept of long pieces.
-_SCALES, _KEPT, _LONG = (1.0, 1.0, 1.0, 10.0, 1e3, 1e-3), (1, 1, 2, 5), 1500
-#: Share of pieces whose displacement is turned round, and of those whose voltage is.
-_TURNED = 0.15
-
-
-class Ended(NamedTuple):
-    """How the diagnosis of a piece ended: a verdict, `refused` or `crashed`, and what was said."""
-
-    piece: str
-    how: str
-    said: str
-    seconds: float
+#: are kept of long pieces; share of pieces whose displacement or voltage is turned round.
+_SCALES, _KEPT, _LONG, _TURNED = (1.0, 1.0, 1.0, 10.0, 1e3, 1e-3), (1, 1, 2, 5), 1500, 0.15
 
 
 def excerpts(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose spoilt pieces of the measured records.
+    """Diagnose spoilt pieces of the measured records; only a verdict or a refusal is allowed.
 
-    Cut anywhere, at any length, decimated, scaled by powers of ten, with either column's sign
-    turned: each must end with a verdict, or be refused in a sentence, and its model must predict
-    the piece.
+    The pieces are cut anywhere, decimated, scaled by powers of ten, and turned round.
     """
-    every = pieces(datasets.micromanipulator(), QUICK_PIECES if quick else PIECES)
-    output = lambda e: f"{e.piece}: {e.how}"  # noqa: E731
-    return Outcome([ends(on_all_cores(ended_of, [(piece,) for piece in every], progress, output))])
+    jobs = [(p,) for p in pieces(datasets.micromanipulator(), QUICK_PIECES if quick else PIECES)]
+    ends = Counter(on_all_cores(end_of, jobs, progress))
+    rows = [{"ended": end, "pieces": n} for end, n in sorted({"crashed": 0, **ends}.items())]
+    return Outcome([TitledTable(f"{len(jobs)} spoilt pieces of measured records", rows)])
 
 
 def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
-    """Return so many pieces of records, in turn, each named for what was done to it."""
+    """Return so many pieces of records, in turn, each named after its changes."""
     rng, result = np.random.default_rng(SEED), []
     for k in range(count):
         whole = records[k % len(records)]
@@ -338,40 +321,21 @@ def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
         turn, sign = (float(rng.choice([-1.0, 1.0], p=[_TURNED, 1 - _TURNED])) for _ in "xv")
         part = whole.slice(first, first + length)
         name = f"{whole.name} {first}:{first + length}:{keep}, x {scale * turn:g}, v {sign:+g}"
-        displayed = scale * turn * np.asarray(part.displacement)[::keep]
+        x = scale * turn * np.asarray(part.displacement)[::keep]
         voltage = sign * part.voltage[::keep]
         result.append(
-            psa.Record(name=name, time=part.time[::keep], voltage=voltage, displacement=displayed)
+            psa.Record(name=name, time=part.time[::keep], voltage=voltage, displacement=x)
         )
     return result
 
 
-def ended_of(piece: psa.Record) -> Ended:
-    """Diagnose a piece; any error but a refusal in words is a crash."""
-    begin = process_time()
+def end_of(piece: psa.Record) -> str:
+    """Diagnose a piece; return the verdict, a refusal, or a crash: any other error."""
     try:
         d = psa.diagnose([piece])
-        finite = all(np.all(np.isfinite(y)) for y in (*d.base, *d.extended))
-        how: str = d.verdict if finite and d.to_json() else "crashed"
-        text = ", ".join(c.effect for c in d.causes)
     except psa.InputError as error:
-        how, text = "refused", str(error)
+        return f"refused: {str(error).split(';')[0][:80]}"
     except Exception as error:  # noqa: BLE001 - what is counted here
-        how, text = "crashed", f"{type(error).__name__}: {error}"
-    return Ended(piece.name, how, text, process_time() - begin)
-
-
-def ends(found: Sequence[Ended]) -> TitledTable:
-    """Return how the pieces ended, and what was said of those that were refused or crashed."""
-    counts = Counter(e.how for e in found)
-    counts["crashed"] += 0
-    failed = [e for e in found if e.how in ("refused", "crashed")]
-    counter = Counter((f"{e.how} because", e.said.split(";")[0][:80]) for e in failed)
-    lines = [(how, n, "") for how, n in sorted(counts.items())]
-    lines += [(how, n, text) for (how, text), n in sorted(counter.items())]
-    slowest = max(found, key=lambda e: e.seconds)
-    return TitledTable(
-        f"{len(found)} spoilt pieces of measured records",
-        [{"ended": how, "pieces": n, "said": text} for how, n, text in lines],
-        f"The slowest took {slowest.seconds:.0f} s of processor time: {slowest.piece}.",
-    )
+        return f"crashed: {type(error).__name__}: {error}"
+    finite = all(np.all(np.isfinite(y)) for y in (*d.base, *d.extended))
+    return d.verdict if finite and d.to_json() else "crashed: a prediction is not finite"

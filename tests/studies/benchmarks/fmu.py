@@ -1,10 +1,10 @@
-"""Work against accuracy: the exported FMU's own solver beside CVode, Radau and LSODA.
+"""Work against accuracy: the solver of the exported FMU against CVode, Radau and LSODA.
 
 Every method meets the same model, the same voltage and the same tolerances. The error is the
 largest one of the displacement, as a share of its range, against the reference integrated at
 1e-12, which shares no code with the model. The FMU is stepped as an importer does: the tolerance in
 the set-up of the experiment, one call for every communication step. Absolute tolerances are rtol
-times the nominal of each state throughout, which is what CVode in fmpy and the FMU's own solver
+times the nominal of each state throughout, which is what CVode in fmpy and the FMU's solver
 take.
 """
 
@@ -74,7 +74,7 @@ class Case(NamedTuple):
         return reference.simulate(self.model.values, self.at, self.times, **how).displacement
 
 
-#: Displacement (n,) of a run, and evaluations of the right-hand side, None if a run of its own
+#: Displacement (n,) of a run, and evaluations of the right-hand side, None if a separate run
 #: counts them.
 Solved = tuple[FloatArray, int | None]
 
@@ -107,7 +107,7 @@ def _cvode(case: Case, fmu: Fmu, tolerance: float) -> Solved:
     """Integrate the model-exchange FMU with the CVode that fmpy carries.
 
     It restarts at jumps of the voltage and at zeros of the FMU's event indicators.
-    fmpy's own `simulate_fmu` sets inputs once a step at most, and not at the right-hand side,
+    `simulate_fmu` of fmpy sets inputs once a step at most, and not at the right-hand side,
     which costs a moving voltage all accuracy; here they are set with every time.
     """
     t, calls, last = case.times, [0], [0.0]
@@ -241,14 +241,14 @@ def _measured(
     name: str, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray, repeats: int
 ) -> Run:
     """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
-    solveds: list[Solved] = []
+    runs: list[Solved] = []
     work = partial(METHODS[name], case, fmu, tolerance)
     try:
-        ((_, seconds),) = least_times([lambda: solveds.append(work())], repeats, _SLOW)
+        ((_, seconds),) = least_times([lambda: runs.append(work())], repeats, _SLOW)
     except FmuError:
         return Run(name, tolerance, inf, inf, inf)
-    displayed, evaluations = solveds[-1]
-    error = float(np.max(np.abs(displayed - truth)) / np.ptp(truth))
+    x, evaluations = runs[-1]
+    error = float(np.max(np.abs(x - truth)) / np.ptp(truth))
     evaluations = _stepped_count(case, tolerance) if evaluations is None else evaluations
     return Run(name, tolerance, error, seconds, evaluations or inf)
 
@@ -295,7 +295,7 @@ def _ratios(case: Case, runs: Sequence[Run]) -> list[dict[str, str]]:
     return rows
 
 
-#: The step of the table [s], and what is asked of it.
+#: The step of the table [s], and its targets.
 STEP, MOST_NS, MOST_RATIO = 1e-5, 400.0, 1.5
 _SOURCE = Path(__file__).parents[2] / "export" / "c_host" / "step_cost.c"
 
@@ -320,9 +320,9 @@ def measured(model: psa.Model, repetitions: int, *, fixed: bool) -> FloatArray:
         command = [*compiler_command(), *OPTIMISE, "-I.", f"-I{Path(fmpy.__file__).parent}/c-code"]
         files = [str(_SOURCE), "stack.c", *compiled_files(texts), "-lm", "-o", "step_cost"]
         run_compiler([*command, *files], folder)
-        items = [token, str(repetitions), str(table["voltage"]), str(table["displacement"])]
+        words = [token, str(repetitions), str(table["voltage"]), str(table["displacement"])]
         done = subprocess.run(
-            [str(folder / "step_cost"), *items], input="\n".join(map(repr, voltage)),
+            [str(folder / "step_cost"), *words], input="\n".join(map(repr, voltage)),
             capture_output=True, text=True, check=True,
         )  # fmt: skip
     return np.array([[float(v) for v in line.split()] for line in done.stdout.splitlines()]).T

@@ -22,7 +22,7 @@ TARGETS: dict[str, Target] = {
 
 
 def chosen_targets(names: Sequence[str]) -> list[Target]:
-    """Return the targets that are named, by their own names or those of their rooms; all for none.
+    """Return the targets that are named, by their names or those of their rooms; all for none.
 
     Raises InputError for a name that is neither.
     """
@@ -39,12 +39,12 @@ def tables(tally: Tally) -> list[TitledTable]:
     """Return what was counted by target, and the distinct failures, if there are any."""
     rows = []
     for name in (*(n for n in TARGETS if tally.inputs[n]), "all"):
-        item = [n for n in TARGETS if name in (n, "all")]
-        inputs, accepted = (sum(c[n] for n in item) for c in (tally.inputs, tally.accepted))
-        seconds = sum(tally.seconds.get(n, 0.0) for n in item)
-        failures = {kind: f"{sum(tally.kinds[n, kind] for n in item):,}" for kind in KINDS}
+        targets = [n for n in TARGETS if name in (n, "all")]
+        inputs, accepted = (sum(c[n] for n in targets) for c in (tally.inputs, tally.accepted))
+        seconds = sum(tally.seconds.get(n, 0.0) for n in targets)
+        kinds = {kind: f"{sum(tally.kinds[n, kind] for n in targets):,}" for kind in KINDS}
         rows.append({
-            "target": name, "inputs": f"{inputs:,}", "accepted": f"{accepted:,}", **failures,
+            "target": name, "inputs": f"{inputs:,}", "accepted": f"{accepted:,}", **kinds,
             "inputs per s of a core": f"{inputs / max(seconds, 1e-9):,.3g}",
         })  # fmt: skip
     counted = TitledTable(
@@ -52,7 +52,7 @@ def tables(tally: Tally) -> list[TitledTable]:
         rows,
         "accepted: read or done without an error; all others were refused with a sentence.",
     )
-    items = [
+    failures = [
         {"target": d.first.target, "kind": d.first.kind, "times": f"{d.times:,}",
          "the first of them": " ".join(d.first.sentence.split())[:150], "input": d.first.index,
          "file": d.file or "-"}
@@ -60,11 +60,11 @@ def tables(tally: Tally) -> list[TitledTable]:
     ]  # fmt: skip
     failed = TitledTable(
         "Distinct failures",
-        items,
+        failures,
         "Again, from the file: python -m tests.studies fuzz --replay FILE;"
         f" from the seed: fuzz --only TARGET --seed {tally.seed} --from INPUT --inputs 1.",
     )
-    return [counted, failed] if items else [counted]
+    return [counted, failed] if failures else [counted]
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -8,7 +8,7 @@ the base's parameters cannot absorb, over the rms of the noise.
 import itertools
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -30,7 +30,7 @@ Kind = Literal[
 
 #: Ranges of rho, from which a case's is drawn evenly in its logarithm.
 ORDINARY, WEAK, STRONG = (0.3, 3.0), (0.1, 0.3), (1.0, 3.0)
-#: A hidden effect counts from this share of the smallest rho that was asked for.
+#: A hidden effect counts from this share of the smallest rho of its case.
 REACHED = 0.9
 #: Classes of voltages that show less than a rich one.
 POOR: tuple[PoorKind, ...] = ("sine", "triangle", "steps", "slow", "loops")
@@ -69,16 +69,14 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a diagnosis said of a case.
+class CaseResult:
+    """The answer of a diagnosis to a case.
 
     `rho` was reached, of several causes the smallest, 0 where nothing is hidden; `named` are the
-    causes, `within` the named ones with what they cannot be told from; `blind` the effects that the
-    record is said not to show. `confidence` is that of the first cause; `probability` and
-    `evidence` are those of each effect in the first step; `ratio` is the held-out rms over that of
-    the noise; `seconds` the processor time; `patch` the unnamed correction that is offered, which
-    would remove the share `patched` of the base's held-out excess (with what effects that are kept
-    in the model without a name remove).
+    causes, `within` these with what cannot be distinguished from them; `blind` the effects that the
+    record cannot show. `probability` is that of each effect in the first step; `seconds` the
+    processor time; `patched` the share of the base's held-out excess that the unnamed correction
+    and the effects that are kept without a name remove.
     """
 
     case: Case
@@ -87,12 +85,8 @@ class Found:
     named: tuple[str, ...]
     within: tuple[str, ...]
     blind: tuple[str, ...]
-    confidence: float
     probability: Mapping[str, float]
-    evidence: Mapping[str, float]
-    ratio: float
     seconds: float
-    patch: str = ""
     patched: float = 0.0
 
     def __str__(self) -> str:
@@ -103,7 +97,7 @@ class Found:
 
     @property
     def reached(self) -> bool:
-        """Whether what is hidden is as visible as was asked for; true where nothing is hidden."""
+        """Whether the visibility of the case is reached; true where nothing is hidden."""
         return self.case.effect is None or self.rho >= REACHED * self.case.rho[0]
 
     @property
@@ -113,13 +107,23 @@ class Found:
         return self.named[0] if one else None
 
     @property
+    def wrong_alone(self) -> bool:
+        """Whether a single wrong cause is named, without a remainder."""
+        return self.alone not in (None, *self.case.hidden)
+
+    @property
     def right_alone(self) -> bool:
         """Whether the hidden effect is the one name, with no other as likely."""
         return self.named == (self.case.right,) == self.within
 
+    @property
+    def in_set(self) -> bool:
+        """Whether all that is hidden is in the named sets."""
+        return set(self.case.hidden) <= set(self.within)
+
 
 def how_made(case: Case) -> dict[str, Any]:
-    """Return what `make_record` is told of a case beside effect and seed."""
+    """Return the arguments of `make_record` for a case, but for effect and seed."""
     return {
         "noise": case.noise, "excitation": case.excitation, "more": case.more,
         "visible": case.rho if case.effect else None,
@@ -136,63 +140,41 @@ def records_of(case: Case) -> tuple[Truth, list[psa.Record]]:
     return truth, [r.slice(0, min(_CUT, r.n)) for r in (record, *more)]
 
 
-def run_case(case: Case, method: Method | None = None, only: bool = False) -> Found:
-    """Make the records of a case, diagnose the files, and compare.
-
-    With `only`, the right effect is the only one in the table.
-    """
+def run_case(case: Case, method: Method | None = None) -> CaseResult:
+    """Make the records of a case, diagnose the files, and compare."""
     truth, records = records_of(case)
     left_out = case.right if case.kind == "left out" else None
-    table = [e for n, e in psa.EFFECTS.items() if (n == case.right if only else n != left_out)]
+    table = [e for n, e in psa.EFFECTS.items() if n != left_out]
     begin = time.process_time()
     d = psa.diagnose(records, effects=table, method=method)
     seconds = time.process_time() - begin
+    kept = d.budget.together.share if d.kept and not d.causes else 0.0
     named, within = names_of(d)
-    return Found(
+    return CaseResult(
         case=case,
         rho=float(min([truth.visible, *(h.visible for h in truth.more)])),
         verdict=d.verdict,
         named=named,
         within=within,
         blind=tuple(b.effect for b in d.blind_to),
-        confidence=d.causes[0].confidence if d.causes else 0.0,
         probability={c.effect: c.probability for c in d.candidates},
-        evidence={c.effect: c.evidence for c in d.candidates},
-        ratio=d.extended_errors.holdout_rms_m / _level(d, truth),
         seconds=seconds,
-        patch="" if d.patch is None else d.patch.name,
-        patched=_patched(d),
+        patched=kept + (d.budget.unnamed.share if d.budget.unnamed is not None else 0.0),
     )
 
 
 def diagnosed(
-    cases: Sequence[Case], progress: Progress, method: Method | None = None, only: bool = False
-) -> list[Found]:
-    """Diagnose cases side by side; with `only`, by a table of the right effect alone."""
-    return on_all_cores(run_case, [(case, method, only) for case in cases], progress)
+    cases: Sequence[Case], progress: Progress, method: Method | None = None
+) -> list[CaseResult]:
+    """Diagnose cases side by side."""
+    return on_all_cores(run_case, [(case, method) for case in cases], progress)
 
 
 def names_of(d: psa.StackDiagnosis) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the named causes, and these with what they cannot be told from."""
+    """Return the named causes, and these with what cannot be distinguished from them."""
     named = tuple(c.effect for c in d.causes)
     similar = (n for c in d.causes for n in c.cannot_be_told_from)
     return named, tuple(dict.fromkeys((*named, *similar)))
-
-
-def _patched(d: psa.StackDiagnosis) -> float:
-    """Return what is offered without a name: the effects that are kept, and the correction."""
-    b = d.budget
-    kept = b.together.share if d.kept and not d.causes else 0.0
-    return kept + (b.unnamed.share if b.unnamed is not None else 0.0)
-
-
-def _level(d: psa.StackDiagnosis, truth: Truth) -> float:
-    """Return the rms of the noise that was added, of a first record in its held-out samples [m]."""
-    if len(d.experiments) > 1:
-        return truth.sigma
-    held = d.experiments[0].held_out
-    noise = np.asarray(d.experiments[0].record.displacement) - truth.displacement
-    return float(np.sqrt(np.mean(noise[held] ** 2)))
 
 
 def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: int) -> list[Case]:
@@ -201,34 +183,32 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     No two cases have a seed, and so stack, voltage and noise, in common.
     """
     seed, rng = itertools.count(first), np.random.default_rng(first)
-    few, half = range(max(1, seeds // 4)), range(max(1, seeds // 2))
+    each, few, half = range(seeds), range(max(1, seeds // 4)), range(max(1, seeds // 2))
+
+    def drawn(kind: Kind, voltages: Sequence[ExcitationKind], count: int) -> list[Case]:
+        """Return cases of one random effect each, with the voltages in turn."""
+        turns = itertools.islice(itertools.cycle(voltages), count)
+        return [Case(kind, str(rng.choice(known)), next(seed), excitation=v) for v in turns]
+
+    def several(kind: Kind, causes: int) -> Case:
+        one, *more = map(str, rng.choice(known, causes, replace=False))
+        return Case(kind, one, next(seed), STRONG, tuple(more))
+
     cases = [
-        Case("known", e, next(seed), noise=NOISES[k % len(NOISES)])
-        for e in known
-        for k in range(seeds)
+        Case("known", e, next(seed), noise=NOISES[k % len(NOISES)]) for e in known for k in each
     ]
+    weak = [e for e in known for _ in few]
     cases += [
-        Case("weak", e, next(seed), WEAK, noise=NOISES[k % len(NOISES)])
-        for k, e in enumerate(e for e in known for _ in few)
+        Case("weak", e, next(seed), WEAK, noise=NOISES[k % len(NOISES)]) for k, e in enumerate(weak)
     ]
     for noise in NOISES[:2]:
         cases += [Case("clean", None, next(seed), noise=noise) for _ in range(10 * seeds)]
     cases += [Case("left out", e, next(seed)) for e in known for _ in few]
     cases += [Case("foreign", e, next(seed)) for e in foreign for _ in half]
-    for _ in range(3 * seeds):
-        one, other = rng.choice(known, 2, replace=False)
-        cases.append(Case("two", str(one), next(seed), STRONG, (str(other),)))
-    for k in range(4 * seeds):
-        poor = POOR[k % len(POOR)]
-        cases.append(Case("poor", str(rng.choice(known)), next(seed), excitation=poor))
-    for k in range(6 * seeds):
-        design = DESIGNS[k % len(DESIGNS)]
-        cases.append(Case("design", str(rng.choice(known)), next(seed), excitation=design))
+    cases += [several("two", 2) for _ in range(3 * seeds)]
+    cases += drawn("poor", POOR, 4 * seeds) + drawn("design", DESIGNS, 6 * seeds)
     for k in range(3 * seeds):
         cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
-    for _ in range(2 * seeds):
-        one, *others = (str(name) for name in rng.choice(known, 3, replace=False))
-        cases.append(Case("three", one, next(seed), STRONG, tuple(others)))
-    for _ in range(3 * seeds):
-        cases.append(Case("six", str(rng.choice(known)), next(seed), records=6))
-    return cases
+    cases += [several("three", 3) for _ in range(2 * seeds)]
+    six = drawn("six", ["rich"], 3 * seeds)
+    return cases + [replace(case, records=6) for case in six]

@@ -48,21 +48,21 @@ def run(progress: Progress, quick: bool) -> Outcome:
     return Outcome((TitledTable(title, rows),), partial(picture, known, d))
 
 
-def picture(found: Known, d: psa.StackDiagnosis) -> Figure:
+def picture(known: Known, d: psa.StackDiagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
     figure = Figure(figsize=(12.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-    _scores(left, found)
+    _scores(left, known)
     _shares(right, d)
     return figure
 
 
-def _scores(axes: Axes, found: Known) -> None:
-    rows = _best(found)[::-1]
+def _scores(axes: Axes, known: Known) -> None:
+    rows = _best(known)[::-1]
     colours = [
-        _BLUE if h is found.answer else _ORANGE if h.names in found.worthy else _GREY for h in rows
+        _BLUE if h is known.answer else _ORANGE if h.names in known.worthy else _GREY for h in rows
     ]
-    scores = [max(found.scale.score(h), 0.0) for h in rows]
+    scores = [max(known.scale.score(h), 0.0) for h in rows]
     axes.barh([_named(h) for h in rows], scores, color=colours)
     axes.set_xlabel("score [ln units]")
     title = "Blue: the answer; orange: may be it;\ngrey: fails a rule"
@@ -88,8 +88,8 @@ def _shares(axes: Axes, d: psa.StackDiagnosis) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _best(found: Known) -> Sequence[Hypothesis]:
-    return sorted(found.found.values(), key=lambda h: -found.scale.score(h))[:_SHOWN]
+def _best(known: Known) -> Sequence[Hypothesis]:
+    return sorted(known.found.values(), key=lambda h: -known.scale.score(h))[:_SHOWN]
 
 
 def _named(h: Hypothesis) -> str:

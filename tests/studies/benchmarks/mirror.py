@@ -13,7 +13,6 @@ measured, without the first 100 samples, for each period of each test signal, an
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -63,7 +62,7 @@ class Mode:
     softer: float
     lossier: float
     driven: ComplexArray
-    shown: ComplexArray
+    sensed: ComplexArray
 
     @property
     def strongest(self) -> int:
@@ -73,7 +72,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Modes:
-    """What frequency responses tell: modes, what follows at once [um/V], lag [s], rise [1/V]."""
+    """What frequency responses determine: modes, feed-through [um/V], lag [s], rise [1/V]."""
 
     modes: tuple[Mode, ...]
     rest: FloatArray
@@ -93,7 +92,7 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
         w_r = w_r0 (1 + softer_r a),    z_r = z_r0 (1 + lossier_r a);
 
     A_r + j B_r = c_r b_r^T is a matrix of rank one for a mode of a structure. The steps of a held
-    voltage drive at all w_n, and samples do not tell these apart.
+    voltage drive at all w_n, and samples do not distinguish these.
     """
     first = next(iter(responses.values()))
     output = np.flatnonzero(np.abs(first[:, 0, 0]) > 0)[1::EVERY]
@@ -112,9 +111,9 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
             gain, stays = 1 + q[-1] * above, np.exp(-1e4 / (RATE * q[-2]))
             drive = gain * held / (1 + 1e-4j * every * q[-2])
             poles = drive / (1 + x**2 + 2 * damping * (1 + lossier * above) * x)
-            items = [np.sum(poles * x**k, axis=1).T for k in range(3)]
+            terms = [np.sum(poles * x**k, axis=1).T for k in range(3)]
             later = np.exp(-1j * w / RATE)[:, None]
-            parts.append([*items, gain * (1 - stays) * later / (1 - stays * later)])
+            parts.append([*terms, gain * (1 - stays) * later / (1 - stays * later)])
         return [np.vstack(part) for part in zip(*parts, strict=True)]
 
     def errors(q: FloatArray) -> FloatArray:
@@ -145,25 +144,25 @@ def modes_of(responses: Mapping[float, ComplexArray]) -> Modes:
     for j, b in enumerate(driven.T):
         first, second = plain * b.real + quick * b.imag, quick * b.real + quicker * b.imag
         rows.append(np.hstack([first, second, rest * np.eye(len(AXES))[j]]))
-    observed = target.reshape(-1, len(AXES), len(AXES)).transpose(2, 0, 1).reshape(-1, len(AXES))
-    factors = solved(np.vstack(rows), observed)[0]
-    displayed = factors[:count] + 1j * factors[count : 2 * count]
+    by_stack = target.reshape(-1, len(AXES), len(AXES)).transpose(2, 0, 1).reshape(-1, len(AXES))
+    factors = solved(np.vstack(rows), by_stack)[0]
+    sensed = factors[:count] + 1j * factors[count : 2 * count]
     modes = []
     for k in np.argsort(q[:count]):
         frequency, damping, softer, lossier = q[:-2].reshape(4, count)[:, k].tolist()
-        modes.append(Mode(frequency, damping, softer, lossier, driven[k], displayed[k]))
+        modes.append(Mode(frequency, damping, softer, lossier, driven[k], sensed[k]))
     return Modes(tuple(modes), factors[2 * count :].T, 1e-4 * float(q[-2]), float(q[-1]))
 
 
 def solved(table: ComplexArray, spectrum: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Return the real factors of columns that come nearest to what is seen, and the rest."""
+    """Return the real factors of columns that fit a spectrum by least squares, and the rest."""
     a, y = (np.vstack([part.real, part.imag]) for part in (table, spectrum))
-    item, upper = np.linalg.qr(a)
-    result = np.linalg.solve(upper, item.T @ y)
-    return result, (y - a @ result).ravel()
+    q, upper = np.linalg.qr(a)
+    factors = np.linalg.solve(upper, q.T @ y)
+    return factors, (y - a @ factors).ravel()
 
 
-def mirror(found: Modes) -> psa.Model:
+def mirror(modes: Modes) -> psa.Model:
     """Return the model: modes q_r [V] that three stacks drive, softer at larger amplitudes.
 
         T v_j' + v_j = gain_j (1 + rise a) u_j,    a = sqrt(s) - 0.2 V
@@ -175,7 +174,7 @@ def mirror(found: Modes) -> psa.Model:
     b* and c* are the parts of the shapes that are a quarter of a period late.
     """
     u, v = ca.SX.sym("u", 3), ca.SX.sym("v", 3)
-    q, w = (ca.SX.sym(n, len(found.modes)) for n in "qw")
+    q, w = (ca.SX.sym(n, len(modes.modes)) for n in "qw")
     power = ca.SX.sym("power")
     above = ca.sqrt(power + 1e-6) - MIDDLE
     names = ("lag", "rise", "softness", *(f"gain_{j + 1}" for j in AXES))
@@ -184,20 +183,20 @@ def mirror(found: Modes) -> psa.Model:
     for j in AXES:
         drive = free[f"gain_{j + 1}"] * (1 + free["rise"] * above) * u[j]
         slope.append((drive - v[j]) / free["lag"])
-    rates, items = [], [sum(found.rest[i, j] * v[j] for j in AXES) for i in AXES]
-    for k, mode in enumerate(found.modes):
+    rates, outputs = [], [sum(modes.rest[i, j] * v[j] for j in AXES) for i in AXES]
+    for k, mode in enumerate(modes.modes):
         omega = 2 * np.pi * mode.frequency * (1 + free["softness"] * mode.softer * above)
         damping = mode.damping * (1 + mode.lossier * above)
         driven = sum(
             b.real * v[j] + b.imag * slope[j] / omega for j, b in enumerate(mode.driven.tolist())
         )
         rates += [omega * w[k], omega * (driven - q[k] - 2 * damping * w[k])]
-        items = [
+        outputs = [
             y + c.real * q[k] + c.imag * w[k]
-            for y, c in zip(items, mode.shown.tolist(), strict=True)
+            for y, c in zip(outputs, mode.sensed.tolist(), strict=True)
         ]
     mean = sum(u[j] ** 2 for j in AXES) / len(AXES)
-    pairs = [s for k in range(len(found.modes)) for s in (q[k], w[k])]
+    pairs = [s for k in range(len(modes.modes)) for s in (q[k], w[k])]
     moving = [*pairs, *(v[j] for j in AXES)]
     return psa.ode_model(
         {
@@ -205,7 +204,7 @@ def mirror(found: Modes) -> psa.Model:
             "u": u,
             "p": ca.vertcat(*free.values()),
             "ode": ca.vertcat(*rates, *slope, (mean - power) / FELT),
-            "y": ca.vertcat(*items),
+            "y": ca.vertcat(*outputs),
         },
         name="steering_mirror",
         states=[
@@ -215,9 +214,9 @@ def mirror(found: Modes) -> psa.Model:
         inputs=[psa.Input(f"u_{j + 1}", "V", "voltage") for j in AXES],
         outputs=[psa.Output(f"y_{i + 1}", "um", "displacement", nominal=3.0) for i in AXES],
         parameters=[
-            psa.Parameter("lag", found.lag, "s", (1e-6, 1e-3), "of the amplifiers", log=True),
+            psa.Parameter("lag", modes.lag, "s", (1e-6, 1e-3), "of the amplifiers", log=True),
             psa.Parameter(
-                "rise", found.rise, "1/V", (-5, 5), "of the gain by amplitude", scale=0.1
+                "rise", modes.rise, "1/V", (-5, 5), "of the gain by amplitude", scale=0.1
             ),
             psa.Parameter("softness", 1.0, "1", (0, 5), "over the responses'", scale=0.2),
             *(
@@ -254,17 +253,13 @@ def played(model: psa.Model, u: FloatArray) -> FloatArray:
 
 def score(y: FloatArray, values: FloatArray) -> FloatArray:
     """Return the authors' score [1] of each output, of arrays (samples, axes, signals, periods)."""
-    errors, observed = (y - values)[SKIPPED:], y[SKIPPED:]
-    ratio = np.sqrt(np.mean(errors**2, axis=0)) / np.std(observed, axis=0)
-    mean: FloatArray = np.mean(ratio, axis=(1, 2))
-    return mean
+    errors = (y - values)[SKIPPED:]
+    ratio = np.sqrt(np.mean(errors**2, axis=0)) / np.std(y[SKIPPED:], axis=0)
+    return np.asarray(np.mean(ratio, axis=(1, 2)))
 
 
-def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
-    """Make the model and score it; `quick` takes it as the frequency responses say.
-
-    Or score the model of a file steering_mirror.json in a folder; else it is written there.
-    """
+def run(progress: Progress, quick: bool) -> Outcome:
+    """Make the model and score it; `quick` takes it as the frequency responses give it."""
     files = datasets.originals("steering_mirror_test")
     data = {
         (s, level, part): np.load(files[f"{s}_{level}mV_{part}.npy"], allow_pickle=False)
@@ -272,51 +267,27 @@ def run(progress: Progress, quick: bool, folder: Path | None = None) -> Outcome:
         for level in LEVELS
         for part in ("train", "test")
     }
-    responses = {v: linear_response(data["u", v, "train"], data["y", v, "train"]) for v in LEVELS}
-    kept = None if folder is None else folder / "steering_mirror.json"
-    if kept is not None and kept.is_file():
-        return _outcome(psa.load_model(kept), data, responses, progress)
     progress("modes of the frequency responses")
-    rms = {v: float(np.sqrt(np.mean(data["u", v, "train"] ** 2))) for v in LEVELS}
-    model = mirror(modes_of({rms[v]: responses[v] for v in LEVELS}))
+    train = {v: (data["u", v, "train"], data["y", v, "train"]) for v in LEVELS}
+    rms = {v: float(np.sqrt(np.mean(u**2))) for v, (u, _) in train.items()}
+    model = mirror(modes_of({rms[v]: linear_response(u, y) for v, (u, y) in train.items()}))
     if not quick:
         progress("identifying lag, gains and softening")
         pieces = [
-            piece(data["u", v, "train"][:, :, k, 1], data["y", v, "train"][:, :, k, 1], f"{v} mV")
-            for k, v in enumerate(LEVELS)
+            piece(u[:, :, k, 1], y[:, :, k, 1], f"{v} mV")
+            for k, (v, (u, y)) in enumerate(train.items())
         ]
-        model = psa.identify(
-            model, pieces, starts=1, zeros=model.output_names, known_start=True
-        ).model
-    if kept is not None:
-        psa.save_model(model, kept)
-    return _outcome(model, data, responses, progress)
-
-
-def _outcome(
-    model: psa.Model,
-    data: Mapping[tuple[str, int, str], FloatArray],
-    responses: Mapping[int, ComplexArray],
-    progress: Progress,
-) -> Outcome:
-    ours, floor = {}, {}
+        fit = psa.identify(model, pieces, starts=1, zeros=model.output_names, known_start=True)
+        model = fit.model
+    scores = []
     for level in LEVELS:
         progress(f"test signals of {level} mV")
         u, y = (data[s, level, "test"] for s in "uy")
-        statement = np.stack([played(model, u[:, :, k]) for k in range(u.shape[2])], axis=2)
-        ours[level] = score(y, statement)
-        lines = np.einsum("kij,kjep->kiep", responses[level], np.fft.rfft(u, axis=0))
-        floor[level] = score(y, np.fft.irfft(lines, n=len(u), axis=0))
+        paths = np.stack([played(model, u[:, :, k]) for k in range(u.shape[2])], axis=2)
+        scores.append(100 * float(np.mean(score(y, paths))))
+    ours = (f"ours, one for all levels, {len(model.state_names)} states", scores)
     rows = [
-        {"model": name, "output": output}
-        | {f"{v} mV": f"{100 * float(np.mean(of[v][axes])):.2f}" for v in LEVELS}
-        for name, of in (
-            (f"ours, one for all levels, {len(model.state_names)} states", ours),
-            ("linear response of the training signals, line by line, one a level", floor),
-        )
-        for output, axes in (("1 to 3", [*AXES]), *((f"{i + 1}", [i]) for i in AXES))
+        {"model": name, **{f"{v} mV": f"{x:.2f}" for v, x in zip(LEVELS, errors, strict=True)}}
+        for name, errors in (ours, *_PUBLISHED)
     ]
-    for name, of in _PUBLISHED:
-        cells = (name, "1 to 3", *(f"{x:.2f}" for x in of))
-        rows.append(dict(zip(rows[0], cells, strict=True)))
     return Outcome((TitledTable("Steering mirror, test signals", rows, _NOTE),))

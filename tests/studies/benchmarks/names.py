@@ -6,26 +6,21 @@ Sources: the study of the golden answers, the exam and both halves of the second
 import itertools
 import re
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.stats import binomtest
 
 import psa_casadi as psa
-from tests.studies.benchmarks.diagnose import draw_classes
-from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable, on_all_cores, styled
+from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable, on_all_cores
 from tests.studies.exam.marks import SURE, Answer, Question, Score, mark, score
 from tests.studies.golden.cases import ASKS, answered
 from tests.studies.second_exam import cases as second
 
-#: Classes of stated probability: above the one, up to the next. Nothing is said above 99 %.
+#: Classes of stated probability: above the one, up to the next. No probability exceeds 99 %.
 BINS = (0.0, 0.5, 0.8, 0.9, 0.98, 1.0)
-#: The log score takes no probability nearer to 0 or 1, which would count without end.
-NEAREST = 1e-3
 #: A quick run takes so many records, evenly from all.
 QUICK = 12
 GROUPS = {
@@ -37,20 +32,19 @@ Stated = tuple[float, bool]
 
 
 @dataclass(frozen=True)
-class Sat:
-    """What was asked and answered: source/name, draw, and processor time [s]."""
+class AnsweredCase:
+    """A case with its answer: source/name, draw, and processor time [s]."""
 
     case: str
     draw: int
-    asked: Question
+    question: Question
     answer: Answer
     seconds: float
 
     def __str__(self) -> str:
         """Return case and answer in a line."""
-        return (
-            f"{self.case}: {self.mark}; {self.answer.verdict}, {self.names} [{self.seconds:.0f} s]"
-        )
+        grade = mark(self.question, self.answer)
+        return f"{self.case}: {grade}; {self.answer.verdict}, {self.names} [{self.seconds:.0f} s]"
 
     @property
     def source(self) -> str:
@@ -60,17 +54,13 @@ class Sat:
     @property
     def group(self) -> str:
         """Its row of the table."""
-        return "odd" if self.asked.group == "clean" and self.asked.noise else self.asked.group
-
-    @property
-    def mark(self) -> str:
-        """The mark of its names."""
-        return mark(self.asked, self.answer)
+        group = self.question.group
+        return "odd" if group == "clean" and self.question.noise else group
 
     @property
     def score(self) -> Score:
-        """What it adds to the figures."""
-        return score(self.asked, self.answer, FAMILIES)
+        """Its contribution to the figures."""
+        return score(self.question, self.answer, FAMILIES)
 
     @property
     def names(self) -> str:
@@ -108,56 +98,53 @@ def run(progress: Progress, quick: bool, only: str = "", seed: Sequence[int] = (
     jobs = [(case, draw) for draw in seed for case in CASES if re.search(only, case)]
     if not jobs:
         raise psa.InputError(f"--only: no case has '{only}'; a case is one like {min(CASES)}.")
-    result = on_all_cores(sat, jobs[:: -(-len(jobs) // QUICK)] if quick else jobs, progress)
-    return Outcome(tables(result), lambda: picture(result))
+    result = on_all_cores(answer_case, jobs[:: -(-len(jobs) // QUICK)] if quick else jobs, progress)
+    return Outcome(tables(result))
 
 
-def sat(case: str, draw: int) -> Sat:
+def answer_case(case: str, draw: int) -> AnsweredCase:
     """Write the record of a case and diagnose it; draw 0 has the seeds of the golden answers."""
     with tempfile.TemporaryDirectory() as folder:
-        requested, path = CASES[case](Path(folder), draw)
+        question, path = CASES[case](Path(folder), draw)
         _, answer, seconds = answered(path)
-    return Sat(case, draw, requested, answer, seconds)
+    return AnsweredCase(case, draw, question, answer, seconds)
 
 
-def tables(found: Sequence[Sat]) -> list[TitledTable]:
+def tables(cases: Sequence[AnsweredCase]) -> list[TitledTable]:
     """Return the figures of each group and source, the reliability, and every answer."""
-    groups = [(g, [f for f in found if f.group == g]) for g in GROUPS]
     rows = []
-    for group, item in groups:
-        sources = dict.fromkeys(f.source for f in item)
-        parts = [(s, [f for f in item if f.source == s]) for s in sources]
-        rows += [_row(GROUPS[group], s, part) for s, part in parts]
-        rows += [_row(GROUPS[group], "all", item)] if len(parts) > 1 else []
-    rows.append(_row("all", "all", found))
+    for group, title in GROUPS.items():
+        of = [f for f in cases if f.group == group]
+        sources = list(dict.fromkeys(f.source for f in of))
+        rows += [_row(title, s, [f for f in of if f.source == s]) for s in sources]
+        rows += [_row(title, "all", of)] if len(sources) > 1 else []
+    rows.append(_row("all", "all", cases))
     each = [
-        {"case": f.case, "draw": f.draw, "mark": f.mark, "verdict": f.answer.verdict,
-         "names": f.names, "s": f"{f.seconds:.1f}"}
-        for f in found
+        {"case": f.case, "draw": f.draw, "mark": mark(f.question, f.answer),
+         "verdict": f.answer.verdict, "names": f.names}
+        for f in cases
     ]  # fmt: skip
     return [
         TitledTable(
             "Names that can be believed", rows,
             "In set, alone, family: all that is hidden is named in sets, alone, or by the right"
             " family, which may be that of what is left without a name, and no name is wrong."
-            " Found: hidden causes that are named. Wrong: of names, of families with 90 % or more."
-            " Honest: not `adequate`, and no name or the right family. s: processor time, median,"
-            " 95th percentile, largest.",
+            " Wrong: of names, of families with 90 % or more. Honest: not `adequate`, and no name"
+            " or the right family.",
         ),
-        _reliability(found),
-        TitledTable("What was said of each", each),
+        _reliability(cases),
+        TitledTable("Each answer", each),
     ]  # fmt: skip
 
 
-def _row(group: str, source: str, sats: Sequence[Sat]) -> Row:
-    scores = [f.score for f in sats]
-    kinds = {f.asked.group for f in sats}
-    hidden, all_hidden = kinds <= {"one", "two", "three"}, [len(f.asked.accepted) for f in sats]
-    sure = [[right for p, right in every if p >= SURE] for every in stated(sats).values()]
-    times = np.quantile([f.seconds for f in sats], (0.5, 0.95, 1.0))
+def _row(group: str, source: str, cases: Sequence[AnsweredCase]) -> Row:
+    scores = [f.score for f in cases]
+    kinds = {f.question.group for f in cases}
+    hidden = kinds <= {"one", "two", "three"}
+    sure = [[right for p, right in every if p >= SURE] for every in stated(cases).values()]
 
-    def count(holds: Callable[[Score], bool], requested: bool) -> str:
-        return f"{sum(map(holds, scores))}/{len(sats)}" if requested else "-"
+    def count(holds: Callable[[Score], bool], counts: bool) -> str:
+        return f"{sum(map(holds, scores))}/{len(cases)}" if counts else "-"
 
     return {
         "hidden": group,
@@ -165,90 +152,33 @@ def _row(group: str, source: str, sats: Sequence[Sat]) -> Row:
         "in set": count(lambda s: s.in_set, hidden),
         "alone": count(lambda s: s.alone, hidden),
         "family": count(lambda s: s.family, kinds <= {"one", "two", "three", "foreign"}),
-        "found": f"{sum(s.found for s in scores)}/{sum(all_hidden)}" if hidden else "-",
         "wrong": ", ".join(f"{len(every) - sum(every)}/{len(every)}" for every in sure),
         "honest": count(lambda s: s.honest, kinds == {"foreign"}),
         "alarms": count(lambda s: s.alarm, kinds == {"clean"}),
-        "s": " ".join(f"{t:.2g}" for t in times),
     }
 
 
-def stated(found: Iterable[Sat]) -> dict[str, list[Stated]]:
+def stated(cases: Sequence[AnsweredCase]) -> dict[str, list[Stated]]:
     """Return what is stated of names and of families."""
-    scores = [f.score for f in found]
     return {
-        "names": [one for s in scores for one in s.names],
-        "families": [one for s in scores for one in s.families],
+        "names": [one for f in cases for one in f.score.names],
+        "families": [one for f in cases for one in f.score.families],
     }
 
 
-def in_class(item: Iterable[Stated], low: float, high: float) -> list[Stated]:
-    """Return what is stated with a probability in (low, high]."""
-    return [(p, right) for p, right in item if low < p <= high]
-
-
-def log_score(item: Sequence[Stated]) -> float:
-    """Return the mean of -ln of the probability of what holds; 0 is best, ln 2 knows nothing.
-
-    Source: I. J. Good, J. R. Stat. Soc. B 14 (1952) 107.
-    """
-    p = np.clip([p if right else 1 - p for p, right in item], NEAREST, 1 - NEAREST)
-    return float(-np.mean(np.log(p))) if item else np.nan
-
-
-def brier_score(item: Sequence[Stated]) -> float:
-    """Return the mean square of probability less outcome; 0 is best, 1/4 knows nothing.
-
-    Source: G. W. Brier, Mon. Weather Rev. 78 (1950) 1.
-    """
-    return float(np.mean([(p - right) ** 2 for p, right in item])) if item else np.nan
-
-
-def _reliability(found: Sequence[Sat]) -> TitledTable:
-    levels, rows = stated(found), []
+def _reliability(cases: Sequence[AnsweredCase]) -> TitledTable:
+    rows = []
     for low, high in itertools.pairwise(BINS):
         row = {"stated": f"{100 * low:.0f} to {100 * high:.0f} %"}
-        for level, every in levels.items():
-            row |= {f"{level}: {k}": v for k, v in _class(in_class(every, low, high)).items()}
+        for level, every in stated(cases).items():
+            pairs = [(p, right) for p, right in every if low < p <= high]
+            mean = f"{100 * np.mean([p for p, _ in pairs]):.0f} %" if pairs else "-"
+            right = f"{sum(right for _, right in pairs)}/{len(pairs)}" if pairs else "-"
+            row |= {f"{level}: mean": mean, f"{level}: right": right}
         rows.append(row)
-    scores = "; ".join(
-        f"{level} log score {log_score(item):.3f}, Brier score {brier_score(item):.3f}"
-        for level, item in levels.items()
-    )
     note = (
         "Every named cause that counts, by its name and its likeliest family, and the likeliest"
-        f" family of what has no name where there is none: {scores}. Bands are"
-        " Wilson's. Where several names are accepted, each is right."
+        " family of what has no name where there is none. Where several names are accepted, each"
+        " is right."
     )
     return TitledTable("Probability against frequency", rows, note)
-
-
-def _class(item: Sequence[Stated]) -> dict[str, str]:
-    """Return the mean probability, how many are right, and the band of that share."""
-    if not item:
-        return dict.fromkeys(("mean", "right", "95 % band"), "-")
-    right = sum(right for _, right in item)
-    band = binomtest(right, len(item)).proportion_ci(method="wilson")
-    return {
-        "mean": f"{100 * np.mean([p for p, _ in item]):.0f} %",
-        "right": f"{right}/{len(item)}",
-        "95 % band": f"{100 * band.low:.0f} to {100 * band.high:.0f} %",
-    }
-
-
-def picture(found: Sequence[Sat]) -> Figure:
-    """Return the reliability diagram of names and families, with binomial 95 % bands."""
-    figure = Figure(figsize=(7.0, 5.5), layout="constrained")
-    axes = figure.subplots()
-    axes.plot([0.0, 100.0], [0.0, 100.0], color="0.7", linewidth=0.8, label="right as stated")
-    for side, (level, every) in zip((-1, 1), stated(found).items(), strict=True):
-        draw_classes(
-            axes, [in_class(every, *ends) for ends in itertools.pairwise(BINS)], side, level
-        )
-    styled(
-        axes, "stated probability, mean of its class, %", "right, % (95 % band)",
-        "How often a stated name or family is right",
-    )  # fmt: skip
-    axes.set(xlim=(-6.0, 112.0), ylim=(-8.0, 108.0))
-    axes.legend(loc="upper left", fontsize=8)
-    return figure

@@ -1,16 +1,14 @@
-"""The paper's identification beside the prediction-error fit, against noise and window.
+"""The paper's identification against the prediction-error fit, against noise and window.
 
 The records are steps of the independent reference. As the paper assumes, nothing but eq. (13) is in
 them: no hysteresis, and a drive a thousand times faster than the stack. White noise is added as a
 share of the step; windows count in slowest time constants.
 """
 
-from collections.abc import Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 import psa_casadi as psa
 from psa_casadi import reference
@@ -22,7 +20,7 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.units import FloatArray
 from tests.identification.paper_cases import coefficients_of_values
 from tests.studies.benchmarks.records import Values, noisy, slowest
-from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, styled
+from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
 
 STACK_NAMES = ("PTBS200", "WYDS0808020", "P-885.51")
 NOISES, WINDOW, SEEDS = (0.0, 1e-5, 1e-4, 1e-3), 40.0, 3
@@ -33,29 +31,12 @@ _SHORT, _LONG, _SHORT_RTOL = 15, 80, 1e-4
 #: No hysteresis; R_s C_p = 13 ns.
 _LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
 _SAMPLES, _RTOL, _JUMP = 5000, 1e-13, 1e-10
-#: Errors below this are drawn at it, and the noise 0 is drawn here.
-_FLOOR = 1e-6
-_COLOURS = {"paper": "#c0392b", "prediction error": "#1f6fb4"}
-
-
-class Case(NamedTuple):
-    """Median relative errors (6,) of a_1..a_5, b_1 for one stack, noise, method."""
-
-    stack: str
-    noise: float
-    method: str
-    errors: FloatArray
 
 
 def run(progress: Progress, quick: bool) -> Outcome:
     """Measure the errors of both methods; `quick` takes two noise levels and one seed."""
     noises, seeds = ((0.0, 1e-4), 1) if quick else (NOISES, SEEDS)
-    items = [c for name in STACK_NAMES for c in _cases(name, noises, seeds, progress)]
-    rows = [
-        {"stack": c.stack, "noise": f"{c.noise:g}", "method": c.method}
-        | {n: number(float(e), 2) for n, e in zip(COEFFICIENTS, c.errors, strict=True)}
-        for c in items
-    ]
+    rows = [row for name in STACK_NAMES for row in _rows(name, noises, seeds, progress)]
     table = TitledTable(
         f"Relative error of the coefficients of eq. (15), step of {WINDOW:g} slowest time"
         " constants, against noise",
@@ -66,7 +47,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
         " off the truth; both methods see the same records. Noise 0 still holds the reference's"
         " tolerance, 1e-13.",
     )
-    return Outcome([table], partial(_picture, items))
+    return Outcome([table])
 
 
 def step_record(values: Values) -> psa.Record:
@@ -104,9 +85,10 @@ def by_fit(record: psa.Record, values: Values) -> FloatArray:
     return coefficients_of_values(last.model.values)
 
 
-def _cases(name: str, noises: Sequence[float], seeds: int, progress: Progress) -> list[Case]:
+def _rows(name: str, noises: Sequence[float], seeds: int, progress: Progress) -> Iterator[Row]:
+    """Yield the median relative errors of both methods at every noise."""
     values = {**psa.stack_model(name).values, **_LINEAR}
-    truth, clean, cases = coefficients_of_values(values), step_record(values), []
+    truth, clean = coefficients_of_values(values), step_record(values)
     end = float(np.asarray(clean.displacement)[-1])
     for noise in noises:
         progress(f"{name}: noise {noise:g}")
@@ -115,28 +97,6 @@ def _cases(name: str, noises: Sequence[float], seeds: int, progress: Progress) -
         by = {"paper": map(by_moments, records),
               "prediction error": (by_fit(r, values) for r in records)}  # fmt: skip
         for method, estimates in by.items():
-            errors = np.median(np.abs(np.array(list(estimates)) / truth - 1.0), axis=0)
-            cases.append(Case(name, noise, method, errors))
-    return cases
-
-
-def _picture(cases: Sequence[Case]) -> Figure:
-    """Draw the errors against noise, one panel a stack: median and range over the coefficients."""
-    figure = Figure(figsize=(15.0, 5.0), layout="constrained")
-    panels = figure.subplots(1, len(STACK_NAMES), sharey=True)
-    for axes, name in zip(panels, STACK_NAMES, strict=True):
-        for method, colour in _COLOURS.items():
-            chosen = [c for c in cases if c.stack == name and c.method == method]
-            noise = [max(c.noise, _FLOOR) for c in chosen]
-            errors = np.maximum(np.array([c.errors for c in chosen]), _FLOOR)
-            low, high = errors.min(axis=1), errors.max(axis=1)
-            axes.fill_between(noise, low, high, color=colour, alpha=0.2)
-            axes.plot(noise, np.median(errors, axis=1), color=colour, marker="o", label=method)
-        axes.axhline(1.0, color="black", linewidth=1.0, linestyle="--")
-        axes.set(xscale="log", yscale="log")
-        ticks = [_FLOOR, *(n for n in NOISES if n)]
-        styled(axes, "noise over the step (1e-6: none)", "", name, ticks=ticks)
-    panels[0].set_ylabel("relative error of $a_1$ to $a_5$, $b_1$")
-    panels[0].legend(title="median, and range over the six")
-    figure.suptitle(f"Coefficients of eq. (15) from a step of {WINDOW:g} slowest time constants")
-    return figure
+            errors = np.median(np.abs(np.array(list(estimates)) / truth - 1.0), axis=0).tolist()
+            figures = {n: number(e, 2) for n, e in zip(COEFFICIENTS, errors, strict=True)}
+            yield {"stack": name, "noise": f"{noise:g}", "method": method, **figures}

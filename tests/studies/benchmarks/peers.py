@@ -1,4 +1,4 @@
-"""Speed beside others: one fit beside scipy's, and many sets of parameters beside three solvers.
+"""Speed against others: one fit against SciPy, and many sets of parameters against three solvers.
 
 All integrate the full stack under a voltage that is linear between its samples. The peers are what
 one would write without this package: `scipy.integrate.solve_ivp` (LSODA) on the reference's
@@ -78,18 +78,16 @@ _REACHED = 1.001
 
 
 def identify(progress: Progress, quick: bool) -> Outcome:
-    """Measure both on one record, then this package's fit on records of growing length.
+    """Measure both on one record.
 
     Both start at the same point near the truth (from farther away the peer stays in a side valley),
     search the same parameters with the same residuals, and stop when they will.
     """
-    length = 2000 if quick else 20_000
-    lengths = (1000, 10_000) if quick else (10_000, 100_000, 1_000_000)
-    return Outcome((_beside_scipy(length, progress), _growth(lengths, progress)))
+    return Outcome([_beside_scipy(2000 if quick else 20_000, progress)])
 
 
 def _record(samples: int) -> psa.Record:
-    """Return a multisine with noise, of this package's own simulation, from rest."""
+    """Return a multisine with noise, simulated by this package, from rest."""
     t, model = time_grid(samples * _SAMPLE_TIME, _SAMPLE_TIME), psa.stack_model(_STACK)
     band = (2.0 / t[-1], max(40.0 / t[-1], 200.0))
     voltage = multisine(t, 0.0, model.values["u_rated"], band, seed=1)
@@ -104,13 +102,13 @@ def _record(samples: int) -> psa.Record:
 Trace = list[tuple[float, float]]
 
 
-def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
-    """Fit a record from the wrong values; return simulations, processor time [s] and trace."""
+def _fitted(record: psa.Record) -> tuple[int, Trace]:
+    """Fit a record from the wrong values; return simulations and trace."""
     model, began, trace = psa.stack_model(_STACK), time.process_time(), Trace()
     made: Any = fitting.Objective
 
-    def traced(*given: Any) -> Callable[[FloatArray], Any]:
-        evaluate = made(*given)
+    def traced(*arguments: Any) -> Callable[[FloatArray], Any]:
+        evaluate = made(*arguments)
 
         def wrapped(theta: FloatArray) -> Any:
             fit = evaluate(theta)
@@ -124,13 +122,13 @@ def _fitted(record: psa.Record) -> tuple[int, float, Trace]:
     with patch.object(fitting, "Objective", traced):
         sigma = [_NOISE * record.range_m]
         fit = fitting.fit(model, [whole(record)], FREE, sigma=sigma, start=start)
-    return fit.evaluations, time.process_time() - began, trace
+    return fit.evaluations, trace
 
 
 def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
     record = _record(samples)
     _fitted(record)  # compiles the model once, as on any first use
-    runs, _, ours = _fitted(record)
+    runs, ours = _fitted(record)
     progress(f"least_squares with solve_ivp on {samples} samples (minutes)")
     theirs = _scipy(record, _NOISE * record.range_m)
     ways = {"psa_casadi, fit": (runs, ours),
@@ -179,30 +177,13 @@ def _scipy(record: psa.Record, sigma: float) -> Trace:
     return trace
 
 
-def _growth(lengths: tuple[int, ...], progress: Progress) -> TitledTable:
-    rows = []
-    for samples in lengths:
-        progress(f"fit to {samples} samples")
-        runs, spent, _ = _fitted(_record(samples))
-        each = 1e6 * spent / runs / samples
-        rows.append({
-            "samples": samples, "CPU time [s]": f"{spent:.2f}", "simulations": runs,
-            "each, per sample [us]": f"{each:.1f}",
-        })  # fmt: skip
-    return TitledTable(
-        "The same fit over the length of the record",
-        rows,
-        "Every simulation carries the derivatives by all parameters; nothing was averaged.",
-    )
-
-
 #: Runs all sets of a work: displacements (sets, n) [m]; not finite where one cannot be integrated.
 Solve = Callable[[], FloatArray]
 #: Makes the run at a tolerance.
 At = Callable[[float], Solve]
 
 SETS, QUICK, SAMPLES, SAMPLE_TIME = 10_000, 200, 10_000, 2e-4
-#: Error over the range that is asked for, and the tolerances of which the loosest is taken.
+#: Target of the error over the range, and the tolerances of which the loosest is taken.
 WANTED, TOLERANCES = 1e-5, tuple(10.0 ** (-k / 2) for k in range(6, 21))
 OURS = "psa.simulate_many"
 #: Parameters that differ between the sets, each by 10 %.
@@ -335,10 +316,10 @@ def cases(samples: int) -> list[psa.Record]:
     return [psa.Record(name=n, time=t, voltage=v) for n, v in voltages.items()]
 
 
-def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Outcome:
+def measured(progress: Progress, records: Sequence[psa.Record], count: int) -> Outcome:
     """Measure all sets of each case by `simulate_many`, and a part of its samples by the others.
 
-    A method runs at the loosest tolerance of one list at which it is as accurate as asked; the
+    A method runs at the loosest tolerance of one list that reaches the target; the
     error is against the reference, which shares no code with any of them. Where there is a GPU, it
     runs 100 times as many.
     """
@@ -349,7 +330,7 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
     model, doubts, done = psa.stack_model("P-885.51"), [], []
     most = max(sets for _, sets in ways.values())
     sets, rows = drawn(model, max(count, most)), []
-    for record in given:
+    for record in records:
         progress(f"{record.name}: reference")
         short = record.slice(0, min(_PART, record.n))
         work = Work(tuple(model.with_values(s) for s in sets[:most]), short)
@@ -360,7 +341,7 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
         def ours(rtol: float, short: psa.Record = short) -> Solve:
             return partial(psa.simulate_many, model, sets[:_JUDGED], short, rtol=rtol)
 
-        item = math.nan
+        our_time = math.nan
         for name, (prepare, together) in {OURS: (None, count), **ways}.items():
             progress(f"{record.name}: {name}")
             at = ours if prepare is None else prepare(work.first(together))
@@ -372,13 +353,14 @@ def measured(progress: Progress, given: Sequence[psa.Record], count: int) -> Out
                 solve = partial(psa.simulate_many, model, sets[:count], record, **how)
             ((wall, spent),) = least_times([solve], _REPEATS, _SLOW)
             each = spent / together / whole_one.n
-            item = each if prepare is None else item
+            our_time = each if prepare is None else our_time
             rows.append({
                 "voltage": record.name, "way": name, "sets": together, "samples": whole_one.n,
                 "tolerance": f"{rtol:.0e}",
                 "largest error / range": number(error, 2) + " (missed)" * (error > WANTED),
                 "wall [s]": number(wall), "processor [s]": number(spent),
-                "us per sample and set": number(1e6 * each), "over ours": number(each / item, 2),
+                "us per sample and set": number(1e6 * each),
+                "over ours": number(each / our_time, 2),
             })  # fmt: skip
     gpu, missing = on_gpu(progress, model, done, MORE * count)
     table = TitledTable(

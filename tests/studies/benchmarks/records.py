@@ -19,8 +19,7 @@ import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.records import multisine, sine, time_grid
 from psa_casadi.units import FloatArray
-from tests.studies.plants.again import play_again
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.make import Truth, make_record, play_again
 
 Values = Mapping[str, float]
 
@@ -98,15 +97,15 @@ def clean_loops(values: Values) -> list[psa.Record]:
 
 
 @lru_cache(maxsize=16)
-def _fast_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
-    values = dict(items)
+def _fast_set(pairs: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
+    values = dict(pairs)
     fast = {"step": step_voltage(values), "multisine": multisine_voltage(values, seed=1)}
     return tuple(played(values, name, *inputs) for name, inputs in fast.items())
 
 
 @lru_cache(maxsize=16)
-def _loop_set(items: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
-    values, result = dict(items), []
+def _loop_set(pairs: tuple[tuple[str, float], ...]) -> tuple[psa.Record, ...]:
+    values, result = dict(pairs), []
     for share, f in product(LOOP_AMPLITUDES, LOOP_FREQUENCIES):
         half, omega = 0.5 * share * values["u_rated"], 2.0 * np.pi * f
 
@@ -140,10 +139,10 @@ def hidden_record(effect: str | None, seed: int, **how: Any) -> tuple[Truth, psa
 
 
 def played_again(
-    truth: Truth, seed: int, given: tuple[FloatArray, FloatArray] | None = None
+    truth: Truth, seed: int, voltage: tuple[FloatArray, FloatArray] | None = None
 ) -> psa.Record:
-    """Return a further record of a device, under a drawn voltage or a given one."""
+    """Return a further record of a device, under a drawn voltage or times and `voltage`."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"record_{seed}.csv"
-        play_again(truth, seed, path, given)
+        play_again(truth, seed, path, voltage)
         return psa.read_record(path)

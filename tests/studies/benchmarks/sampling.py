@@ -1,4 +1,4 @@
-"""Effective samples per second beside the published way: an ordinary differential equation in PyMC.
+"""Effective samples per second against the published way, a differential equation in PyMC.
 
 `pymc.ode.DifferentialEquation` integrates the equation and its sensitivities by LSODA and calls the
 right hand side in Python. Both ways sample one density (the same record, priors and coordinates,
@@ -36,11 +36,10 @@ SEED, ACCEPT = 3, 0.9
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Draws (n, size) of theta, gradients evaluated for them, processor time [s] with tuning."""
+    """Draws (n, size) of theta, and their processor time [s] with tuning."""
 
     way: str
     theta: FloatArray
-    gradients: float
     seconds: float
 
     @property
@@ -69,7 +68,7 @@ def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
 
 
 def stack() -> psa.Model:
-    """Return the stack with a lag too short to be seen at the record's rates."""
+    """Return the stack with a lag too short to be visible at the record's rates."""
     return psa.stack_model(STACK).with_values({"tau": 1e-5})
 
 
@@ -84,29 +83,17 @@ def record() -> psa.Record:
 
 
 def drawn_by_psa(task: Task, draws: int, tune: int) -> Drawn:
-    """Return draws by the sampler and the gradients of `psa.sample`, in one chain."""
-    counted = _Counted(task)
+    """Return draws by the sampler of `psa.sample`, in one chain."""
     began = time.process_time()
     with one_thread():
-        chains = chains_of(counted, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
+        chains = chains_of(task.density, chains=1, draws=draws, tune=tune, seed=SEED, cores=1)
     spent = time.process_time() - began
     theta = np.array([task.density.theta(u) for u in chains.u[0]])
-    return Drawn("psa.sample", theta, counted.count, spent)
-
-
-class _Counted:
-    """A density that counts how often it is evaluated."""
-
-    def __init__(self, task: Task) -> None:
-        self.density, self.size, self.count = task.density, task.density.size, 0
-
-    def __call__(self, u: FloatArray, /) -> tuple[float, FloatArray]:
-        self.count += 1
-        return self.density(u)
+    return Drawn("psa.sample", theta, spent)
 
 
 def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
-    """Return draws by PyMC's sampler with its own solution of the equation, in one chain."""
+    """Return draws by PyMC's sampler with PyMC's solution of the equation, in one chain."""
     pm, pt = import_module("pymc"), import_module("pytensor.tensor")
     factor = np.linalg.cholesky(task.covariance)
     with pm.Model():
@@ -117,13 +104,11 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
         began = time.process_time()
         result = pm.sample(
             draws=draws, tune=tune, chains=1, cores=1, step=step, random_seed=SEED,
-            progressbar=False, compute_convergence_checks=False, discard_tuned_samples=False,
+            progressbar=False, compute_convergence_checks=False,
         )  # fmt: skip
         spent = time.process_time() - began
     moved = result.posterior["u"].to_numpy()[0]
-    groups = (result.sample_stats, result.warmup_sample_stats)
-    steps = sum(float(g["n_steps"].sum()) for g in groups)
-    return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, steps, spent)
+    return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, spent)
 
 
 def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
@@ -133,7 +118,7 @@ def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
     """
     values, unknowns = task.model.values, task.unknowns
     names = unknowns.names
-    table = {
+    drawn_values = {
         n: float(unknowns.reference[k]) * (pt.exp(theta[k]) if unknowns.log[k] else 1.0)
         + (0.0 if unknowns.log[k] else theta[k] * float(unknowns.scale[k]))
         for k, n in enumerate(names)
@@ -147,12 +132,14 @@ def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:
         times=inputs.time[1:], n_states=1, n_theta=3, t0=float(inputs.time[0]),
     )  # fmt: skip
     start = theta[first] * float(scale)
-    force = solve(y0=[start], theta=[table["A"], table["delta"], table["n"]])[:, 0]
+    force = solve(y0=[start], theta=[drawn_values["A"], drawn_values["delta"], drawn_values["n"]])[
+        :, 0
+    ]
     whole = pt.concatenate([pt.stack([start]), force])
     compliance = 1.0 / values["k_P"] + 1.0 / values["k_B"]
-    displayed = compliance * (table["k_L"] * pt.as_tensor(inputs.voltage) + whole)
+    predicted = compliance * (drawn_values["k_L"] * pt.as_tensor(inputs.voltage) + whole)
     errors = (
-        displayed + theta[first + 1] * unknowns.offset_scale - pt.as_tensor(inputs.displacement)
+        predicted + theta[first + 1] * unknowns.offset_scale - pt.as_tensor(inputs.displacement)
     )
     (block,) = task.density.blocks
     known = np.isfinite(unknowns.prior)
@@ -180,19 +167,17 @@ def hysteresis_rate(force: Any, t: Any, p: Any, values: Any, pt: Any) -> Any:
     )
 
 
-def speed(found: list[Drawn]) -> TitledTable:
-    """Return gradients, effective samples and processor time of each way, and their ratio."""
-    sizes = [f.effective for f in found]
-    each = [size / f.seconds for size, f in zip(sizes, found, strict=True)]
+def speed(drawn: list[Drawn]) -> TitledTable:
+    """Return effective samples and processor time of each way, and their ratio."""
+    sizes = [f.effective for f in drawn]
+    each = [size / f.seconds for size, f in zip(sizes, drawn, strict=True)]
     rows = [
-        {"way": f.way, "draws": len(f.theta), "gradients": f"{f.gradients:.0f}",
-         "a gradient [ms]": number(1e3 * f.seconds / f.gradients),
-         "smallest bulk ESS": f"{size:.0f}", "processor [s]": number(f.seconds),
-         "ESS per second": number(rate)}
-        for f, size, rate in zip(found, sizes, each, strict=True)
+        {"way": f.way, "draws": len(f.theta), "smallest bulk ESS": f"{size:.0f}",
+         "processor [s]": number(f.seconds), "ESS per second": number(rate)}
+        for f, size, rate in zip(drawn, sizes, each, strict=True)
     ]  # fmt: skip
     return TitledTable(
-        f"One posterior of {found[0].theta.shape[1]} unknowns and {SAMPLES} samples, two ways",
+        f"One posterior of {drawn[0].theta.shape[1]} unknowns and {SAMPLES} samples, two ways",
         rows,
         f"psa.sample has {each[0] / each[1]:.0f} times the effective samples per second. Processor"
         " times hold tuning and drawing, and no compiling; one chain each.",

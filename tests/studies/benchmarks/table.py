@@ -13,17 +13,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 
 from psa_casadi.report.words.tables import Table
 
 T = TypeVar("T")
 FloatArray = npt.NDArray[np.float64]
-#: Tells a step of long work.
+#: Reports a step of long work.
 Progress = Callable[[str], None]
-#: One row of a table: what stands in each column, by the column's head.
+#: One row of a table: the cell of each column, by the column's head.
 Row = Mapping[str, object]
 
 
@@ -63,7 +61,7 @@ def on_all_cores(
 ) -> list[T]:
     """Return function(*job) of every job, in their order, worked on side by side.
 
-    `report` says in words what one has given.
+    `report` returns a line about one result.
     """
     with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn")) as pool:
         futures = [pool.submit(function, *job) for job in jobs]
@@ -113,22 +111,3 @@ def bench(name: str, of: str = "run") -> Any:
     module, _, function = place.partition(":")
     result = import_module(f"tests.studies.benchmarks.{module}")
     return getattr(result, (function or of) if of == "run" else of, None)
-
-
-def styled(
-    axes: Axes, x: str = "", y: str = "", title: str = "", *, size: float = 10.5,
-    ticks: Iterable[float] = (),
-) -> None:  # fmt: skip
-    """Give axes labels and a title, a light grid below the curves, and small numbers.
-
-    Where there are `ticks`, a logarithmic axis below has these alone.
-    """
-    axes.set_xlabel(x, fontsize=size)
-    axes.set_ylabel(y, fontsize=size)
-    axes.set_title(title, loc="left", fontsize=size)
-    axes.grid(visible=True, which="major", color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    if places := sorted(ticks):
-        axes.set_xticks(places, [f"{v:g}" for v in places])
-        axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.tick_params(labelsize=size - 2)

@@ -83,11 +83,6 @@ AMPLIFIER = named(
 ELECTRICAL = ("current limit", "leakage")
 
 
-def amplified(command: Floats, run: Run) -> Floats:
-    """Return the amplifier's output."""
-    return run.changed(AMPLIFIER, command)
-
-
 def stack_voltage(output: Floats, run: Run) -> Floats:
     """Return the voltage on the stack behind R_s C_p, of which a leak keeps what is fast."""
     hidden = run.record.hidden
@@ -182,7 +177,7 @@ def temperature(run: Run) -> Floats:
 
 
 def displacement(strain: Floats, run: Run) -> Floats:
-    """Return the displacement [um] of a stack whose free strain is given [V]."""
+    """Return the displacement [um] of a stack from its free strain [V]."""
     moved = _vibrating(strain, run)
     modes = run.record.hidden.get("mode", ())
     if modes:
@@ -381,7 +376,7 @@ def _interference(y: Floats, run: Run, values: Values) -> Floats:
 
 
 def _second_device(y: Floats, run: Run, values: Values) -> Floats:
-    """Another actuator that moves the stack: size, frequency [Hz] of its own triangle."""
+    """Another actuator that moves the stack: size, frequency [Hz] of its triangle."""
     size, frequency = values
     slow = 1 + 0.3 * np.sin(2 * math.pi * frequency * 0.37 * run.times)
     return y + size * run.record.stack.stroke * triangle(frequency * run.times + 0.13) * slow
@@ -404,11 +399,6 @@ READING = named(
 )
 #: Step of the reading, as a share of the noise's rms.
 QUANTUM = 0.2
-
-
-def reading(displacement: Floats, run: Run) -> Floats:
-    """Return what the sensor reads of a displacement, without noise."""
-    return run.changed(READING, displacement)
 
 
 def with_noise(clean: Floats, record: Record) -> Floats:

@@ -1,23 +1,23 @@
-"""Marks of the exam: what an answer of the diagnosis is worth.
+"""Marks of the exam: grades of an answer of the diagnosis.
 
 A record has one set of accepted names for each hidden cause. A name is a hit if it is in such a
 set, `modal_series` of any order also where `structural_mode` is.
 
 * Clean: `adequate` is right, and so is an accepted name (a hum as small as the noise), of a stack
   that is not Bouc-Wen's also one of HYSTERESIS, whose form differs from the base model's. A further
-  name beside it, or another alone, is wrong. No name is an alarm, of other hysteresis an honest
+  name with it, or another alone, is wrong. No name is an alarm, of other hysteresis an honest
   one.
 * One cause or several: right alone if all are hit and no name has a rival; right in a set if one
   has, or if a hit is itself the rival of a name; half if not all are hit. Names of HYSTERESIS count
   neither way on a stack that is not Bouc-Wen's; any other name is a wrong extra. `adequate` and no
-  name at all are marks of their own.
+  name at all are separate marks.
 * Foreign: no name is right, and so is what comes nearest. `adequate` is a miss.
 
-A set may hold families too, "place kind" as in "plant relaxation": what `score` counts beside the
+A set may hold families too, "place kind" as in "plant relaxation": what `score` counts besides
 marks. A family is right if it is in a set, or that of a name in it, or if the name is right.
 
 Where a wrong name has 90 % or more and nothing is right, the mark says so; of a clean record also
-where it is beside a right one.
+where it comes with a right one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -61,7 +61,10 @@ class Question:
 
 @dataclass(frozen=True)
 class Named:
-    """A named cause, its probability, what it cannot be told from, and its likeliest family."""
+    """A named cause, its probability, its rivals, and its likeliest family.
+
+    Rivals are the effects that cannot be distinguished from it.
+    """
 
     effect: str
     probability: float
@@ -158,14 +161,13 @@ def _surely(wrong: Sequence[Named]) -> str:
 class Score:
     """What an answer adds to the figures of many.
 
-    How many hidden causes are hit; whether all are and no name is wrong: in a set, alone, or by
-    their families, of which one may be that of what is left without a name; whether a foreign cause
-    is answered honestly (no name, or the right one or family), and a clean record with an alarm.
+    Whether all hidden causes are hit and no name is wrong: in a set, alone, or by their families,
+    of which one may be that of what is left without a name; whether a foreign cause is answered
+    honestly (no name, or the right one or family), and a clean record with an alarm.
     `names` and `families` are what is stated: a probability and whether it is right, of every name
     that counts, or of what is left where there is no name.
     """
 
-    found: int
     in_set: bool
     alone: bool
     family: bool
@@ -177,33 +179,30 @@ class Score:
 
 def score(question: Question, answer: Answer, families: Mapping[str, str]) -> Score:
     """Return what an answer adds to the figures; `families` has that of each name."""
-    statement, sets = mark(question, answer), question.accepted
+    grade, sets = mark(question, answer), question.accepted
     wide = [names | {families[n] for n in names if n in families} for names in sets]
 
     def of_family(family: str) -> int | None:
         return next((k for k, known in enumerate(wide) if family in known), None)
 
     neutral = HYSTERESIS if question.other_hysteresis else frozenset()
-    if question.other_hysteresis:  # what is left of it is told rightly, but is none of the hidden
+    if question.other_hysteresis:  # a name of its rest is right, but is none of the hidden causes
         wide.append(frozenset({"plant hysteresis"}))
-    result, covered, counted = set[int](), {of_family(answer.left)}, []
+    covered, counted = {of_family(answer.left)}, []
     for cause in answer.causes:
         hit = _hit_of(cause, sets)
         place = of_family(cause.family) if hit is None else hit
-        if hit is not None:
-            result.add(hit)
         covered.add(place)
         if hit is not None or cause.effect not in neutral:
             counted.append((cause, place))
     right = all(place is not None for _, place in counted)
     stated = [(c.of_family, c.family) for c, _ in counted] or [(answer.of_left, answer.left)]
     return Score(
-        found=len(result),
-        in_set=statement in (ALONE, IN_SET),
-        alone=statement == ALONE,
+        in_set=grade in (ALONE, IN_SET),
+        alone=grade == ALONE,
         family=right and bool(sets) and covered >= set(range(len(sets))),
-        honest=statement != MISSED and right,
-        alarm=statement not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
+        honest=grade != MISSED and right,
+        alarm=grade not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
         names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c, _ in counted),
         families=tuple((p, of_family(family) is not None) for p, family in stated if family),
     )

@@ -13,10 +13,8 @@ from tests.studies.exam.causes import (
     MASSES,
     MOTION,
     READING,
-    amplified,
     displacement,
     free_strain,
-    reading,
     stack_voltage,
     temperature,
     with_noise,
@@ -58,10 +56,10 @@ def play(record: Record) -> Played:
     step = 1 / test.rate / test.steps
     run = Run(record, np.arange(test.samples * test.steps, dtype=np.float64) * step, step)
     command = draw_voltage(run)
-    output = amplified(command, run)
+    output = run.changed(AMPLIFIER, command)
     u = stack_voltage(output, run)
     strain = free_strain(_hysteretic(u, run), u, run)
-    clean = reading(displacement(strain, run), run)
+    clean = run.changed(READING, displacement(strain, run))
     columns = {}
     if test.monitor:
         columns["monitor_voltage [V]"] = output / _MONITOR

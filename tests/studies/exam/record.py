@@ -19,7 +19,7 @@ HysteresisKind = Literal[
     "Bouc-Wen", "Preisach", "relays", "Prandtl-Ishlinskii", "Coleman-Hodgdon", "Duhem"
 ]
 
-#: Two resonances of a stack, unless the record has its own: f_1 [Hz], zeta_1, f_2 [Hz], zeta_2.
+#: Two resonances of a stack, unless the record states others: f_1 [Hz], zeta_1, f_2 [Hz], zeta_2.
 MECHANICS = (6e3, 0.02, 21e3, 0.03)
 
 
@@ -79,7 +79,7 @@ class Record:
 
     name: str
     seed: int
-    says: str
+    hides: str
     stack: Stack
     test: Test
     hidden: Mapping[str, Values] = field(default_factory=dict)

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 from psa_casadi import InputError, PsaError
 
-#: Ways to fail. The first two are seen from outside: a signal, and no end within the limit.
+#: Ways to fail. The first two are visible from outside: a signal, and no end within the limit.
 CRASH, HANG = "crash", "hang"
 FOREIGN, FALSE_PASS = "foreign error", "false pass"
 HALF_WRITTEN, LEFT_OVER, WRONG_EXIT = "half-written", "left over", "wrong exit"
@@ -34,7 +34,7 @@ _SLICE = 2.0
 _FORK = multiprocessing.get_context("fork")
 
 
-class Found(NamedTuple):
+class Finding(NamedTuple):
     """Something that must not be: its kind and a sentence."""
 
     kind: str
@@ -52,7 +52,7 @@ class Target:
     """One thing that is attacked.
 
     `make` returns an input drawn from a generator. `attack` does something with it in an empty
-    folder and yields what must not be; an error of the package says that the input was refused,
+    folder and yields what must not be; an error of the package is a refusal of the input,
     which is right, any other is a failure. `share` is the part of a room's time that it gets,
     `limit_s` how long one input may take, `memory` what a process may take beside what it has
     [bytes]. `prepare` is called before the first process is forked, which has what it loads.
@@ -62,7 +62,7 @@ class Target:
     room: str
     suffix: str
     make: Callable[[Draw], bytes]
-    attack: Callable[[bytes, Path], Iterator[Found]]
+    attack: Callable[[bytes, Path], Iterator[Finding]]
     share: float = 1.0
     limit_s: float = 10.0
     memory: int | None = 1 << 30
@@ -71,13 +71,13 @@ class Target:
 
 @dataclass(frozen=True)
 class Failure:
-    """An input that led to something that must not be; `alike` is equal for one cause."""
+    """An input that led to something that must not be; `signature` is equal for one cause."""
 
     target: str
     kind: str
     sentence: str
     index: int
-    alike: str
+    signature: str
     detail: str = ""
 
 
@@ -191,7 +191,7 @@ def _counted(
             yield _Block(target, failure.index, failure.index + 1, alone=True)
             continue
         tally.kinds[target.name, failure.kind] += 1
-        key = (target.name, failure.kind, failure.alike)
+        key = (target.name, failure.kind, failure.signature)
         known = tally.distinct.setdefault(key, Distinct(failure))
         known.times += 1
         if known.times > 1:
@@ -206,7 +206,7 @@ def _counted(
 
 
 class _Worker:
-    """A process that attacks the inputs of a block, and what it has said so far."""
+    """A process that attacks the inputs of a block, and its messages so far."""
 
     def __init__(self, block: _Block, seed: int, until: float) -> None:
         self.block, self.index, self.since = block, block.first, time.monotonic()
@@ -223,7 +223,7 @@ class _Worker:
         theirs.close()
 
     def has_ended(self) -> bool:
-        """Hear what the process says; end one that hangs."""
+        """Read the messages of the process; end one that hangs."""
         try:
             while self._heard.poll():
                 self._hear(*self._heard.recv())
@@ -258,8 +258,8 @@ class _Worker:
             return
         self.seconds = time.monotonic() - self._begun
         trace = (self.folder / "trace").read_text(errors="replace")[:6000]
-        items = [x.strip() for x in trace.splitlines() if "psa_casadi/" in x]
-        where = items[0].split("psa_casadi/")[-1].replace('"', "") if items else "an unknown place"
+        lines = [x.strip() for x in trace.splitlines() if "psa_casadi/" in x]
+        where = lines[0].split("psa_casadi/")[-1].replace('"', "") if lines else "an unknown place"
         sentence, name = f"{how}, in {where}", self.block.target.name
         self.failures.append(Failure(name, kind, sentence, self.index, sentence, trace))
 
@@ -295,9 +295,9 @@ def _work(
 def _attack_all(
     block: _Block, seed: int, until: float, folder: Path, connection: Connection, parent: int
 ) -> None:
-    target, item, work = block.target, folder / "tmp", folder / "work"
-    item.mkdir()
-    os.environ["TMPDIR"], tempfile.tempdir = str(item), str(item)
+    target, temporary, work = block.target, folder / "tmp", folder / "work"
+    temporary.mkdir()
+    os.environ["TMPDIR"], tempfile.tempdir = str(temporary), str(temporary)
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         os.dup2(nowhere, stream)
@@ -319,26 +319,26 @@ def _attack_all(
             pass
         except Exception as error:  # noqa: BLE001 - counted as a failure
             connection.send(("fails", _foreign(target, error, index)))
-        if left := sorted(os.listdir(item)):
-            shutil.rmtree(item, ignore_errors=True)
-            item.mkdir(exist_ok=True)
-            result = Found(LEFT_OVER, f"left in TMPDIR: {', '.join(left[:3])}")
+        if left := sorted(os.listdir(temporary)):
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(exist_ok=True)
+            result = Finding(LEFT_OVER, f"left in TMPDIR: {', '.join(left[:3])}")
             connection.send(("fails", _failure(target, result, index)))
         connection.send(("ends", int(accepted)))
     used = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     connection.send(("whole", sum(u.ru_utime + u.ru_stime for u in used)))
 
 
-def _failure(target: Target, found: Found, index: int) -> Failure:
-    plain = "".join(c for c in found.sentence.split("'")[0] if not c.isdigit())
-    return Failure(target.name, found.kind, found.sentence[:2000], index, plain[:120])
+def _failure(target: Target, finding: Finding, index: int) -> Failure:
+    plain = "".join(c for c in finding.sentence.split("'")[0] if not c.isdigit())
+    return Failure(target.name, finding.kind, finding.sentence[:2000], index, plain[:120])
 
 
 def _foreign(target: Target, error: Exception, index: int) -> Failure:
     """Return the failure that an error is, with the innermost function of the package."""
     frames = traceback.extract_tb(error.__traceback__)
-    item = [f for f in frames if f"{os.sep}psa_casadi{os.sep}" in f.filename] or list(frames)
-    where = f"{item[-1].filename.split(f'psa_casadi{os.sep}')[-1]}:{item[-1].name}"
+    ours = [f for f in frames if f"{os.sep}psa_casadi{os.sep}" in f.filename] or list(frames)
+    where = f"{ours[-1].filename.split(f'psa_casadi{os.sep}')[-1]}:{ours[-1].name}"
     similar, whole = (
         f"{type(error).__name__} in {where}",
         "".join(traceback.format_exception(error)),
@@ -349,9 +349,9 @@ def _foreign(target: Target, error: Exception, index: int) -> Failure:
 
 
 def replay(path: Path, targets: Mapping[str, Target]) -> Tally:
-    """Attack with the content of a file that a campaign saved; its name begins with the target's.
+    """Attack with the content of a saved file, whose name starts with that of the target.
 
-    Raises InputError where there is no such file, or its name says no target.
+    Raises InputError where there is no such file, or its name has no target.
     """
     name = next((n for n in targets if path.name.startswith(f"{n}-")), None)
     if name is None or not path.is_file():

@@ -31,13 +31,13 @@ from tests.studies.fuzz.campaign import (
     HANG,
     LEFT_OVER,
     WRONG_EXIT,
-    Found,
+    Finding,
     Target,
 )
 
 #: How long a command may take [s].
 LIMIT_S = 300.0
-#: Root of the checkout, where the package is found from any directory.
+#: Root of the checkout, from which the package can be imported.
 _ROOT = Path(__file__).resolve().parents[3]
 LIBC = ctypes.CDLL(None)
 _END_WITH_PARENT = 1  # of Linux's prctl
@@ -131,43 +131,43 @@ def environment(folder: Path, around: Around) -> dict[str, str]:
 
 def _session(number: int) -> tuple[int, ...]:
     """Return the processes of a session that still run, where they can be listed."""
-    items = []
+    numbers = []
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = (entry / "stat").read_text().rsplit(")", 1)[1].split()
             if int(words[3]) == number and words[0] != "Z":
-                items.append(int(entry.name))
-    return tuple(items)
+                numbers.append(int(entry.name))
+    return tuple(numbers)
 
 
 def misbehaved(
     ended: Ended, codes: Sequence[int], what: str, *, mute: bool = False
-) -> Iterator[Found]:
+) -> Iterator[Finding]:
     """Yield what is wrong with an end: exit code, traceback, blame of the package, no reason.
 
     A `mute` one has nowhere to say a reason.
     """
     last = " ".join(ended.err.strip().rpartition("\n")[2].split())[:300] or "nothing is said"
     if ended.hung:
-        yield Found(HANG, f"{what}: no end within the limit")
+        yield Finding(HANG, f"{what}: no end within the limit")
         return
     if "Traceback" in ended.err or "Traceback" in ended.out:
-        yield Found(FOREIGN, f"{what}: a traceback: {last}")
+        yield Finding(FOREIGN, f"{what}: a traceback: {last}")
     elif "fault of psa_casadi" in ended.err:
-        yield Found(FOREIGN, f"{what}: it blames itself: {last}")
+        yield Finding(FOREIGN, f"{what}: it blames itself: {last}")
     elif ended.code not in codes:
         kind = CRASH if -ended.code in _FAULTS else WRONG_EXIT
-        yield Found(kind, f"{what}: exit code {ended.code}: {last}")
+        yield Finding(kind, f"{what}: exit code {ended.code}: {last}")
     elif 0 < ended.code < 128 and not mute and not ended.err.strip() and not ended.out.strip():
-        yield Found(WRONG_EXIT, f"{what}: exit code {ended.code} without a word")
+        yield Finding(WRONG_EXIT, f"{what}: exit code {ended.code} without a word")
     if ended.left:
-        yield Found(LEFT_OVER, f"{what}: {len(ended.left)} processes go on")
+        yield Finding(LEFT_OVER, f"{what}: {len(ended.left)} processes go on")
 
 
-def left_files(folder: Path, what: str) -> Iterator[Found]:
-    """Yield what stands in the temporary folder."""
+def left_files(folder: Path, what: str) -> Iterator[Finding]:
+    """Yield what is left in the temporary folder."""
     if names := sorted(os.listdir(folder / "tmp")):
-        yield Found(LEFT_OVER, f"{what}: {len(names)} left in TMPDIR: {', '.join(names[:3])}")
+        yield Finding(LEFT_OVER, f"{what}: {len(names)} left in TMPDIR: {', '.join(names[:3])}")
 
 
 @dataclass(frozen=True)
@@ -202,7 +202,7 @@ WORKS: Mapping[str, Work] = {
 
 @cache
 def given_files() -> dict[str, bytes]:
-    """Return the files that the commands are given; the record is fitted in a second."""
+    """Return the files that the commands read; the record is fitted in a second."""
     rows = ["time [s],voltage [V],displacement [um]"]
     for k in range(400):
         u, y = 50 - 50 * math.cos(0.016 * k), 5 - 5 * math.cos(0.016 * k - 0.1)
@@ -219,7 +219,7 @@ def given_files() -> dict[str, bytes]:
 
 @contextmanager
 def place(where: Path) -> Iterator[Path]:
-    """Yield a folder with the given files, which anybody may write to, and remove it."""
+    """Yield a folder with the files of `given_files`, which anybody may write to, and remove it."""
     where.parent.chmod(0o755)
     where.chmod(0o777)
     folder = Path(tempfile.mkdtemp(dir=where))
@@ -235,10 +235,10 @@ def place(where: Path) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def half_written(folder: Path, work: Work, what: str, *, may_miss: bool) -> Iterator[Found]:
+def half_written(folder: Path, work: Work, what: str, *, may_miss: bool) -> Iterator[Finding]:
     for output in work.outputs:
         if reason := _not_whole(folder / output, may_miss=may_miss):
-            yield Found(HALF_WRITTEN, f"{what}: {output} {reason}")
+            yield Finding(HALF_WRITTEN, f"{what}: {output} {reason}")
 
 
 def _not_whole(path: Path, *, may_miss: bool) -> str:
@@ -294,7 +294,7 @@ def _kill_case(rng: Random) -> bytes:
     return json.dumps(case).encode()
 
 
-def _kill(data: bytes, where: Path) -> Iterator[Found]:
+def _kill(data: bytes, where: Path) -> Iterator[Finding]:
     """End a command: its files are whole or none, and nothing is left."""
     case = json.loads(data)
     work, name = WORKS[case["command"]], case["signal"]
@@ -309,13 +309,13 @@ def _kill(data: bytes, where: Path) -> Iterator[Found]:
         yield from half_written(folder, work, what, may_miss=not case["old"] and ended.code != 0)
         after = WORKS["export modelica"]
         if name == "SIGKILL" and (then := psa(after.arguments, folder)).code:
-            yield Found(WRONG_EXIT, f"{what}: the next command fails: {then.err[-300:]}")
+            yield Finding(WRONG_EXIT, f"{what}: the next command fails: {then.err[-300:]}")
         yield from left_files(folder, what)
         known = {*given_files(), *work.outputs, *after.outputs, "out", "err", "tmp", "cache"}
         others = {*os.listdir(folder)} - known
         others |= {p.name for p in folder.glob("cache/models/*") if p.is_dir()}
         if others:
-            yield Found(LEFT_OVER, f"{what}: it leaves '{', '.join(sorted(others)[:3])}'")
+            yield Finding(LEFT_OVER, f"{what}: it leaves '{', '.join(sorted(others)[:3])}'")
 
 
 TARGETS = (Target("kills", "kills", ".json", _kill_case, _kill, 1.0, 4 * LIMIT_S, None, _slowness),)

@@ -22,7 +22,7 @@ from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.model.model_file import dumps, loads
 from tests.export.fmu_models import entries, exported
-from tests.studies.fuzz.campaign import FALSE_PASS, Found, Target
+from tests.studies.fuzz.campaign import FALSE_PASS, Finding, Target
 from tests.studies.fuzz.commands import LIMIT_S, left_files, misbehaved, psa
 from tests.studies.fuzz.damage import WORDS, damaged_bytes, damaged_words
 
@@ -95,7 +95,7 @@ def _bomb(content: dict[str, bytes], rng: Random) -> bytes:
 
 
 def _lying(content: dict[str, bytes], rng: Random) -> bytes:
-    """An entry whose header says another size, checksum, method or flag than it has."""
+    """An entry whose header has another size, checksum, method or flag than it has."""
     data = bytearray(_packed(content))
     mark = rng.choice((b"PK\x01\x02", b"PK\x03\x04"))
     place = rng.choice([k for k in range(len(data) - 46) if data[k : k + 4] == mark])
@@ -152,7 +152,7 @@ def _damaged_xml(data: bytes, rng: Random) -> bytes:
     return text
 
 
-def _check(data: bytes, folder: Path) -> Iterator[Found]:
+def _check(data: bytes, folder: Path) -> Iterator[Finding]:
     """Let the command check an FMU: it ends in order and passes none that differs."""
     path = folder / "x.fmu"
     path.write_bytes(data)
@@ -160,11 +160,11 @@ def _check(data: bytes, folder: Path) -> Iterator[Found]:
     yield from misbehaved(ended, (0, 1, 2), "psa check")
     yield from left_files(folder, "psa check")
     if ended.code == 0 and (what := _difference(path)):
-        yield Found(FALSE_PASS, f"psa check passes an FMU with {what}")
+        yield Finding(FALSE_PASS, f"psa check passes an FMU with {what}")
     if ended.code == 0 and "FAIL" in ended.out:
-        yield Found(FALSE_PASS, "psa check ends with 0 in spite of a row that failed")
+        yield Finding(FALSE_PASS, "psa check ends with 0 in spite of a row that failed")
     if Path("/tmp/psa_fuzz_evil").exists() or list(folder.parent.rglob("evil*")):
-        yield Found(FALSE_PASS, "an FMU wrote outside of its folder")
+        yield Finding(FALSE_PASS, "an FMU wrote outside of its folder")
 
 
 def _difference(path: Path) -> str:
@@ -263,20 +263,22 @@ def _checksum(data: bytes | bytearray) -> int:
     return value
 
 
-def _take(data: bytes, _: Path) -> Iterator[Found]:
+def _take(data: bytes, _: Path) -> Iterator[Finding]:
     """Take a damaged state and step from it; a sound one gives the same outputs afterwards."""
     instance, blob = _instance(*_KINDS[data[0]]), data[1:]
     before, taken = instance.values(instance.state), False
     try:
         instance.values(blob)
         taken = True
-        instance.step(20.0, 5 * _STEP)  # an error that the FMU tells is right
+        instance.step(20.0, 5 * _STEP)  # an error from the FMU is right
     except FMICallException:
         pass
     if taken and struct.unpack_from("<Q", blob, 24)[0] != _checksum(blob[32:]):
-        yield Found(FALSE_PASS, "a state with a wrong checksum is taken")
+        yield Finding(FALSE_PASS, "a state with a wrong checksum is taken")
     if instance.values(instance.state) != before:
-        yield Found(FALSE_PASS, "after a damaged state, a sound one does not give the same outputs")
+        yield Finding(
+            FALSE_PASS, "after a damaged state, a sound one does not give the same outputs"
+        )
     if not taken:
         raise InputError("the state is refused")
 

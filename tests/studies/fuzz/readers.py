@@ -35,7 +35,7 @@ from tests.export.fmu_models import model_named
 from tests.model.evidence_models import evident_model
 from tests.records.laboratory_bytes import gcs, hdf5, lvm, mat, named, npy, npz, parquet, tdms, xlsx
 from tests.records.reading_here import answered_by_fork
-from tests.studies.fuzz.campaign import FALSE_PASS, Found, Target
+from tests.studies.fuzz.campaign import FALSE_PASS, Finding, Target
 from tests.studies.fuzz.damage import (
     WORDS,
     damaged_bytes,
@@ -143,8 +143,8 @@ def _record_file(suffix: str, rng: Random) -> bytes:
         parts[name] = damaged_bytes(parts[name], rng, (b"<", b">", b"&", b'"', b"<row>", b"f8"))
         stream = io.BytesIO()
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-            for item, content in parts.items():
-                archive.writestr(zipfile.ZipInfo(item), content)
+            for part, content in parts.items():
+                archive.writestr(zipfile.ZipInfo(part), content)
         return stream.getvalue()
     if suffix == ".parquet" and kind < 0.7:  # what describes the columns, with its own length
         start = len(data) - 8 - struct.unpack_from("<I", data, len(data) - 8)[0]
@@ -153,7 +153,7 @@ def _record_file(suffix: str, rng: Random) -> bytes:
     return damaged_bytes(data, rng, _MARKS)
 
 
-def _read(suffix: str, data: bytes, folder: Path) -> Iterator[Found]:
+def _read(suffix: str, data: bytes, folder: Path) -> Iterator[Finding]:
     """Read a record and yield what is unsound in it."""
     path = folder / f"r{suffix}"
     path.write_bytes(data)
@@ -162,41 +162,41 @@ def _read(suffix: str, data: bytes, folder: Path) -> Iterator[Found]:
     yield from _unsound(record)
 
 
-def _unsound(record: psa.Record) -> Iterator[Found]:
+def _unsound(record: psa.Record) -> Iterator[Finding]:
     """Yield what a record that was read may not be: short, uneven, not finite, back in time."""
     for name in COLUMNS:
         values = getattr(record, name)
         if values is None:
             continue
         if values.shape != record.time.shape or values.dtype != np.float64:
-            yield Found(FALSE_PASS, f"the {name} has shape {values.shape} and {values.dtype}")
+            yield Finding(FALSE_PASS, f"the {name} has shape {values.shape} and {values.dtype}")
         elif np.isinf(values).any() or (name != "displacement" and np.isnan(values).any()):
-            yield Found(FALSE_PASS, f"the {name} of a record that was read is not finite")
+            yield Finding(FALSE_PASS, f"the {name} of a record that was read is not finite")
     if record.time.size < 16 or not (np.diff(record.time) > 0).all():
-        yield Found(FALSE_PASS, "the time of a record that was read stands still or is short")
+        yield Finding(FALSE_PASS, "the time of a record that was read stands still or is short")
     if record.displacement is None or np.isfinite(record.displacement).sum() < 16:
-        yield Found(FALSE_PASS, "a record that was read has too few displacements")
+        yield Finding(FALSE_PASS, "a record that was read has too few displacements")
 
 
 def _words(texts: tuple[str, ...], words: tuple[str, ...], rng: Random) -> bytes:
     return damaged_words(rng.choice(texts), rng, words).encode("utf-8", "replace")
 
 
-def _parse_unit(data: bytes, _: Path) -> Iterator[Found]:
+def _parse_unit(data: bytes, _: Path) -> Iterator[Finding]:
     text = data.decode()
     unit = parse_unit(text)
     if not (unit.ratio > 0 and unit.name and math.isfinite(unit.factor)):
-        yield Found(FALSE_PASS, f"a unit has the factor {unit.factor}")
+        yield Finding(FALSE_PASS, f"a unit has the factor {unit.factor}")
     coherent = si_unit(text)
     if convert(convert(1.0, text, coherent), coherent, text) - 1.0 > 1e-9:
-        yield Found(FALSE_PASS, "a unit does not convert back")
+        yield Finding(FALSE_PASS, "a unit does not convert back")
 
 
-def _parse_map(data: bytes, folder: Path) -> Iterator[Found]:
+def _parse_map(data: bytes, folder: Path) -> Iterator[Finding]:
     """Read a column map, then a sound file with it."""
     for name, source in parse_columns(data.decode()).items():
         if name not in COLUMNS or not source.array:
-            yield Found(FALSE_PASS, f"a column map holds {name!r}={source.array!r}")
+            yield Finding(FALSE_PASS, f"a column map holds {name!r}={source.array!r}")
     path = folder / "mapped.csv"
     rows = sound_files()[".csv"][3].decode().partition("\n")[2]
     path.write_text(f"{_OTHER_NAMES}\n{rows}", encoding="utf-8")
@@ -205,7 +205,7 @@ def _parse_map(data: bytes, folder: Path) -> Iterator[Found]:
 
 @cache
 def model_trees() -> tuple[Any, ...]:
-    """Return the content of sound model files: stacks, effects, parts, own models, evidence."""
+    """Return the content of sound model files: stacks, effects, parts, other models, evidence."""
     base = model_named("manipulator")
     origin = Provenance(
         identified_from=(("a.csv", "0" * 64),), package_version="0.1.0", free=("A", "C_p"),
@@ -222,11 +222,11 @@ def model_trees() -> tuple[Any, ...]:
         *(psa.part_model(name) for name in psa.PARTS),
         *(with_ports(make()) for make in (cylinder, motor, oscillator, oven, pair, tanks)),
     ]
-    items = [json.loads(dumps(m)) for m in models]
-    return (*items, {"format": "psa_casadi.diagnosis/1", "verdict": "adequate", "causes": []})
+    trees = [json.loads(dumps(m)) for m in models]
+    return (*trees, {"format": "psa_casadi.diagnosis/1", "verdict": "adequate", "causes": []})
 
 
-def _load_model(data: bytes, folder: Path) -> Iterator[Found]:
+def _load_model(data: bytes, folder: Path) -> Iterator[Finding]:
     """Load a model, which is saved and loads equal; some are described as FMUs, which is slow."""
     first, second = folder / "first.json", folder / "second.json"
     first.write_bytes(data)
@@ -235,13 +235,13 @@ def _load_model(data: bytes, folder: Path) -> Iterator[Found]:
     again = psa.load_model(second)
     for what in ("values", "provenance", "evidence", "name", "description"):
         if getattr(again, what) != getattr(model, what):
-            yield Found(FALSE_PASS, f"a model that was loaded is saved with other {what}")
+            yield Finding(FALSE_PASS, f"a model that was loaded is saved with other {what}")
     if [c.name for c in again.components] != [c.name for c in model.components]:
-        yield Found(FALSE_PASS, "a model that was loaded is saved with other components")
+        yield Finding(FALSE_PASS, "a model that was loaded is saved with other components")
     if again.own_starts() != model.own_starts():
-        yield Found(FALSE_PASS, "a model that was loaded is saved with other starts")
+        yield Finding(FALSE_PASS, "a model that was loaded is saved with other starts")
     if dumps(again) != second.read_text(encoding="utf-8"):
-        yield Found(FALSE_PASS, "a model that was loaded is saved in another way the second time")
+        yield Finding(FALSE_PASS, "a model that was loaded is saved in another way the second time")
     if zlib.crc32(data) % 16 == 0:
         plant = model.plant()
         texts = {f"FMI {n}": model_description(plant, "m", "x", ["m.c"], n) for n in (2, 3)}
@@ -250,18 +250,18 @@ def _load_model(data: bytes, folder: Path) -> Iterator[Found]:
         yield from _not_in_numbers(texts)
 
 
-def _not_in_numbers(texts: dict[str, str]) -> Iterator[Found]:
+def _not_in_numbers(texts: dict[str, str]) -> Iterator[Finding]:
     """Yield which of the files that an FMU has are no XML, or hold no finite numbers."""
     for name, text in texts.items():
         try:
             root = ET.fromstring(text.encode("utf-8"))
         except (ET.ParseError, UnicodeEncodeError) as error:
-            yield Found(FALSE_PASS, f"{name} is no XML: '{error}'")
+            yield Finding(FALSE_PASS, f"{name} is no XML: '{error}'")
             continue
         keys = ("start", "nominal", "min", "max") if name.startswith("FMI") else ("value",)
         values = [float(e.get(key, "0").split()[0]) for e in root.iter() for key in keys]
         if not np.isfinite(values).all():
-            yield Found(FALSE_PASS, f"{name} has a value that is not finite")
+            yield Finding(FALSE_PASS, f"{name} has a value that is not finite")
 
 
 def _path_text(rng: Random) -> bytes:
@@ -271,16 +271,16 @@ def _path_text(rng: Random) -> bytes:
     return damaged_table(rng.choice((plain, comma)), rng)
 
 
-def _read_path(data: bytes, folder: Path) -> Iterator[Found]:
+def _read_path(data: bytes, folder: Path) -> Iterator[Finding]:
     file = folder / "target.csv"
     file.write_bytes(data)
     target = read_target(file)
     if not (np.isfinite(target.time).all() and np.isfinite(target.displacement).all()):
-        yield Found(FALSE_PASS, "a path that was read is not finite")
+        yield Finding(FALSE_PASS, "a path that was read is not finite")
     elif target.time.size < 10 or not (np.diff(target.time) > 0.0).all():
-        yield Found(FALSE_PASS, "the time of a path that was read stands still or is short")
+        yield Finding(FALSE_PASS, "the time of a path that was read stands still or is short")
     elif not (0.0 < target.span < np.inf):
-        yield Found(FALSE_PASS, "a path that was read has no finite span")
+        yield Finding(FALSE_PASS, "a path that was read has no finite span")
 
 
 _SHARES = {".csv": 4.0, ".mat": 4.0, ".parquet": 1.5, ".xlsx": 2.0, ".tdms": 1.5, ".h5": 0.5,

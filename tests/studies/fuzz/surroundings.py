@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from psa_casadi.errors import InputError
-from tests.studies.fuzz.campaign import LEFT_OVER, WRONG_EXIT, Draw, Found, Target
+from tests.studies.fuzz.campaign import LEFT_OVER, WRONG_EXIT, Draw, Finding, Target
 from tests.studies.fuzz.commands import (
     LIBC,
     LIMIT_S,
@@ -207,7 +207,7 @@ def _surroundings_case(rng: Draw) -> bytes:
     return json.dumps({"surroundings": names[rng.turn % len(names)], "run": run}).encode()
 
 
-def _surround(data: bytes, where: Path) -> Iterator[Found]:
+def _surround(data: bytes, where: Path) -> Iterator[Finding]:
     """Run a command in odd surroundings, as a user without rights: it works or names the cause."""
     case = json.loads(data)
     chosen, work = SURROUNDINGS[case["surroundings"]], WORKS[case["run"]]
@@ -228,15 +228,15 @@ def _surround(data: bytes, where: Path) -> Iterator[Found]:
             os.close(stream)
         mute = "stderr" in around.streams
         yield from misbehaved(ended, (0, 1, 2) if chosen.words else (0,), what, mute=mute)
-        statement = (ended.err + ended.out).lower()
-        if ended.code in (1, 2) and not any(word in statement for word in chosen.words):
+        words = (ended.err + ended.out).lower()
+        if ended.code in (1, 2) and not any(word in words for word in chosen.words):
             tail = " ".join(ended.err.split())[-200:]
-            yield Found(WRONG_EXIT, f"{what}: the failure does not name its cause: {tail}")
+            yield Finding(WRONG_EXIT, f"{what}: the failure does not name its cause: {tail}")
         yield from half_written(target, work, what, may_miss=ended.code != 0)
         yield from left_files(folder, what)
 
 
-def _many(data: bytes, where: Path) -> Iterator[Found]:
+def _many(data: bytes, where: Path) -> Iterator[Finding]:
     """Run many commands at once on one empty cache; all give the same."""
     count = json.loads(data)["commands"]
     with place(where) as folder:
@@ -250,11 +250,11 @@ def _many(data: bytes, where: Path) -> Iterator[Found]:
         for process in running:
             _, err = process.communicate()
             if process.returncode:
-                yield Found(WRONG_EXIT, f"{what}: one says {err.decode()[-200:]}")
+                yield Finding(WRONG_EXIT, f"{what}: one says {err.decode()[-200:]}")
         if (n := len({(folder / f"{k}.csv").read_bytes() for k in range(count)})) != 1:
-            yield Found(WRONG_EXIT, f"{what} give {n} results")
+            yield Finding(WRONG_EXIT, f"{what} give {n} results")
         if left := [p.name for p in (folder / "cache" / "models").iterdir() if p.is_dir()]:
-            yield Found(LEFT_OVER, f"{what} leave folders: {', '.join(left[:3])}")
+            yield Finding(LEFT_OVER, f"{what} leave folders: {', '.join(left[:3])}")
 
 
 TARGETS = (

@@ -1,4 +1,4 @@
-"""Golden answers: what the package says of fixed cases, kept as text, and what has changed of it.
+"""Golden answers: the answers of the package to fixed cases, kept as text, and their changes.
 
     python -m tests.studies.golden [--only PATTERN] [--twelfth] [--accept] [--workers N]
 

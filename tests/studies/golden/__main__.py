@@ -1,8 +1,9 @@
-"""The command: run the cases side by side, show what changed, and keep it if that is asked."""
+"""The command: run the cases side by side, show what changed, and keep it on request."""
 
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -11,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from tests.studies.golden.cases import CASES, Row, chosen
+from tests.studies.golden.cases import CASES, Row
 from tests.studies.golden.compare import SECONDS, keep, kept, table, totals, twelfth
 
 #: One thread for each case; compiled as users have it, so that times compare.
@@ -31,15 +32,15 @@ def answered(case: str) -> Row:
 
 
 def run(
-    ids: Sequence[str], workers: int, told: Callable[[str, Row], object] = lambda *_: None
+    ids: Sequence[str], workers: int, report: Callable[[str, Row], object] = lambda *_: None
 ) -> dict[str, Row]:
-    """Return the answers, each worked on in a process of its own; a case that fails says so."""
+    """Return the answers, each from a separate process; the row of a failed case has its error."""
     with ThreadPoolExecutor(workers) as pool:
         jobs = {pool.submit(_apart, case): case for case in ids}
         result = {}
         for job in as_completed(jobs):
             result[jobs[job]] = job.result()
-            told(jobs[job], job.result())
+            report(jobs[job], job.result())
     return {case: result[case] for case in ids}
 
 
@@ -74,20 +75,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if inputs.answer:
         print(json.dumps(answered(inputs.answer)))
         return 0
-    before, ids = kept(), [case.id for case in chosen(inputs.only)]
+    before, ids = kept(), [case for case in CASES if re.search(inputs.only, case)]
     if inputs.twelfth:
         ids = twelfth([i for i in ids if i in before], before)
     if not ids:
         parser.error(f"no case has the pattern '{inputs.only}'; there are {', '.join(CASES)}")
     ids.sort(key=lambda i: -float(before.get(i, {}).get(SECONDS, "1e9")))
 
-    def told(case: str, row: Row) -> None:
-        statement = next((row[n] for n in ("failed", "causes", "told", "code") if n in row), "")
-        print(f"{case}: {row.get('verdict', '')} {statement} [{row[SECONDS]} s]", file=sys.stderr)
+    def report(case: str, row: Row) -> None:
+        answer = next((row[n] for n in ("failed", "causes", "told", "code") if n in row), "")
+        print(f"{case}: {row.get('verdict', '')} {answer} [{row[SECONDS]} s]", file=sys.stderr)
         if inputs.accept and "failed" not in row:
             keep({case: row})
 
-    now = run(ids, inputs.workers, told)
+    now = run(ids, inputs.workers, report)
     _shown(table(before, now))
     print()
     _shown(totals(before, now))

@@ -1,7 +1,6 @@
-"""The cases: records with known causes, measured ones, models of one's own, and exports."""
+"""The cases: records with known causes, measured ones, models of users, and exports."""
 
 import json
-import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -38,13 +37,13 @@ class Case:
         return f"{self.kind}/{self.name}"
 
 
-# --- what a diagnosis says ---------------------------------------------------------------------
+# --- answers of a diagnosis ---------------------------------------------------------------------
 
 
-def answered(*given: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
+def answered(*arguments: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
     """Return a diagnosis as it is written, what it names, and its processor time [s]."""
     begin = time.process_time()
-    table = psa.diagnose(*given, **words).to_dict()
+    table = psa.diagnose(*arguments, **words).to_dict()
     seconds = time.process_time() - begin
     causes = (
         Named(c["effect"], c["confidence"], tuple(c["cannot_be_told_from"]), *_family(c))
@@ -59,9 +58,9 @@ def _family(of: dict[str, Any]) -> tuple[str, float]:
     return (f"{first['place']} {first['kind']}", first["probability"]) if first else ("", 0.0)
 
 
-def diagnosed(question: Question | None, *given: Any, **words: Any) -> Row:
+def diagnosed(question: Question | None, *arguments: Any, **words: Any) -> Row:
     """Return a diagnosis as text, with its mark where the truth is known (`exam.marks`)."""
-    output, answer, seconds = answered(*given, **words)
+    output, answer, seconds = answered(*arguments, **words)
     base, extended = _errors(output["errors"])
     budget, patch = output["budget"], output.get("patch") or output.get("correction") or {}
     return {
@@ -160,7 +159,7 @@ three preload_loss+drive_lag+offset_drift
 """
 
 
-#: Families of the plants' foreign effects, place and kind, that a displacement lets be told.
+#: Families of the plants' foreign effects, place and kind, that a displacement can distinguish.
 _FAMILIES = {
     "dry_friction": ("plant hysteresis",),
     "floor_vibration": ("environment time", "sensor time"),
@@ -195,7 +194,7 @@ def _studied(
 def _asks() -> Iterator[tuple[str, str, str, Ask]]:
     """Kind, name, what is hidden, and what writes it."""
     for record in RECORDS:
-        yield "exam", record.name, record.says, partial(_sat, record)
+        yield "exam", record.name, record.hides, partial(_sat, record)
     for k, line in enumerate(_STUDY.strip().splitlines()):
         kind, causes, how = (*line.split(), "white")[:3]
         hidden = () if causes == "-" else tuple(causes.split("+"))
@@ -210,7 +209,7 @@ def _asked(ask: Ask, folder: Path) -> Row:
     return diagnosed(*ask(folder, 0))
 
 
-# --- measured records, models of one's own -----------------------------------------------------
+# --- measured records, models of users -----------------------------------------------------
 
 
 def _measured(fitted: list[int], held_out: list[int], folder: Path) -> Row:
@@ -259,7 +258,7 @@ def _own(name: str, folder: Path) -> Row:
 
 
 def _identified(folder: Path) -> Row:
-    """Return what `psa identify` says of a sound stack: what is told, and its intervals."""
+    """Return which parameters of a sound stack `psa identify` determines, with intervals."""
     record, file = folder / "record.csv", folder / "found.json"
     make_record(None, 990101, record, excitation="loops", visible=None)
     done("identify", record, "--json", file, "--quiet")
@@ -269,7 +268,7 @@ def _identified(folder: Path) -> Row:
         names.setdefault(parameter["determined"], []).append(name)
     output = (content["parameters"][name] for name in names["determined"])
     return {
-        "told": "; ".join(f"{how}: {' '.join(item)}" for how, item in names.items()),
+        "told": "; ".join(f"{how}: {' '.join(of)}" for how, of in names.items()),
         "parameters": _numbers([x for p in output for x in (p["value"], *p["interval"])]),
         "base": _numbers([content["rms_m"]]),
     }
@@ -288,8 +287,3 @@ def _all() -> Iterator[Case]:
 
 
 CASES = {case.id: case for case in _all()}
-
-
-def chosen(pattern: str) -> list[Case]:
-    """Return the cases whose kind/name has a pattern."""
-    return [case for case in CASES.values() if re.search(pattern, case.id)]

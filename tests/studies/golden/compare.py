@@ -37,11 +37,11 @@ def keep(rows: Mapping[str, Row]) -> None:
     every = {**kept(), **rows}
     ANSWERS.mkdir(exist_ok=True)
     for kind in dict.fromkeys(case.kind for case in CASES.values()):
-        items = [c for c in CASES.values() if c.kind == kind and c.id in every]
-        names = [n for n in every[items[0].id] if n != "hidden"] if items else []
+        cases = [c for c in CASES.values() if c.kind == kind and c.id in every]
+        names = [n for n in every[cases[0].id] if n != "hidden"] if cases else []
         table = [("case", "hidden", *names)]
-        table += [(c.name, c.hidden, *(every[c.id][n] for n in names)) for c in items]
-        if items:
+        table += [(c.name, c.hidden, *(every[c.id][n] for n in names)) for c in cases]
+        if cases:
             text = "\n".join("\t".join(row) for row in table) + "\n"
             (ANSWERS / f"{kind}.tsv").write_text(text, "utf-8")
 
@@ -109,8 +109,8 @@ def totals(before: Mapping[str, Row], now: Mapping[str, Row]) -> list[tuple[str,
 
     lines: list[tuple[str, str, str, str]] = []
     for kind in dict.fromkeys(case.split("/")[0] for case in both):
-        items = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
-        line(kind, items, "right", _right)
+        marked = [c for c in both if c.startswith(kind) and now[c].get("mark", "-") != "-"]
+        line(kind, marked, "right", _right)
     line("all", both, "processor time", lambda r: f"{sum(float(x[SECONDS]) for x in r):.0f} s")
     line("all", errors, "held-out error, extended over base", lambda r: f"{_error_ratio(r):.4f}")
     return lines
@@ -136,5 +136,5 @@ def twelfth(ids: Iterable[str], before: Mapping[str, Row]) -> list[str]:
     kinds: dict[str, list[str]] = {}
     for case in ids:
         kinds.setdefault(case.split("/")[0], []).append(case)
-    dozens = (item[k : k + 12] for item in kinds.values() for k in range(0, len(item), 12))
+    dozens = (of[k : k + 12] for of in kinds.values() for k in range(0, len(of), 12))
     return [min(dozen, key=lambda c: float(before[c][SECONDS])) for dozen in dozens]

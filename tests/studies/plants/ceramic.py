@@ -73,17 +73,6 @@ def _piece(
     return np.asarray(out, dtype=np.float64)
 
 
-def creep(times: FloatArray, elongation: FloatArray, t_0: float) -> FloatArray:
-    """Creep for g = 1 at uniform times, (N,) [m]; each increment is placed in the middle of its
-    interval.
-    """
-    step = float(times[1] - times[0])
-    increments = np.diff(elongation)
-    age = step * (np.arange(times.size - 1) + 0.5)
-    kernel = np.log10(1.0 + age / t_0)
-    return np.concatenate(([0.0], fftconvolve(increments, kernel)[: times.size - 1]))
-
-
 @hidden("g", "1", (0.003, 0.05), linear=True, drawn=lambda d: {"t_0": d.uniform(0.05, 0.1)})
 def slow_creep(run: Run, p: Parameters, gain: float) -> FloatArray:
     """True logarithmic creep, superposed over the whole history of the elongation.
@@ -97,7 +86,11 @@ def slow_creep(run: Run, p: Parameters, gain: float) -> FloatArray:
     of relaxations is a set of exponentials with a last time constant, after which it stops;
     the logarithm is a continuous spectrum and never stops.
     """
-    return gain * creep(run.times, run.displacement, p["t_0"])
+    step = float(run.times[1] - run.times[0])
+    age = step * (np.arange(run.times.size - 1) + 0.5)  # in the middle of each interval
+    kernel = np.log10(1.0 + age / p["t_0"])
+    crept = fftconvolve(np.diff(run.displacement), kernel)[: run.times.size - 1]
+    return np.asarray(gain * np.concatenate(([0.0], crept)))
 
 
 def play(voltage: FloatArray, threshold: float, start: float = 0.0) -> FloatArray:
@@ -143,17 +136,6 @@ def _plays(
     return values
 
 
-def growth(rate: FloatArray, q: float) -> FloatArray:
-    """lg(1 + |u'|/q), (M,) [1]."""
-    return np.asarray(np.log10(1.0 + np.abs(rate) / q), dtype=np.float64)
-
-
-def drive_rate(run: Run) -> FloatArray:
-    """u' = (v - u)/(R_s C_p) along the path, 0 at every reversal, [V/s]."""
-    command = np.interp(run.path.path_time, run.path.time, run.fine_command)
-    return (command - run.path.path_voltage) / run.stack.drive_time
-
-
 def _growing_plays(d: Draw) -> dict[str, float]:
     """Rate q [V/s] where growth begins, share W of the force that plays, and the plays."""
     span = d.run.stack.u_rated
@@ -181,7 +163,9 @@ def rate_dependent_hysteresis(run: Run, p: Parameters, gain: float) -> FloatArra
     measured.
     """
     voltage = run.path.path_voltage
-    wider = 1.0 + gain * growth(drive_rate(run), p["q"])
+    command = np.interp(run.path.path_time, run.path.time, run.fine_command)
+    rate = (command - voltage) / run.stack.drive_time  # 0 at every reversal
+    wider = 1.0 + gain * np.log10(1.0 + np.abs(rate) / p["q"])
     total = np.zeros_like(voltage)
     for j in range(_GROWING):
         change = moving_play(voltage, p[f"r_{j}"] * wider) - play(voltage, p[f"r_{j}"])
@@ -259,11 +243,6 @@ def rate_independent_asymmetry(run: Run, p: Parameters, gain: float) -> FloatArr
     return pushed(run, force + stack.k_l * run.path.voltage - run.force)
 
 
-def rayleigh(voltage: FloatArray) -> FloatArray:
-    """R [V^2], (M,): half the square of the distance from each reversal, added up."""
-    return with_memory(voltage, lambda distance: 0.5 * distance**2)
-
-
 @hidden(
     "g", "1", (1e-3, 0.4), linear=True,
     drawn=lambda d: {"p": d.uniform(0.7, 1.5), "w": d.uniform(0.2, 0.5)},
@@ -284,7 +263,8 @@ def field_dependent_gain(run: Run, p: Parameters, gain: float) -> FloatArray:
     span, w = run.stack.u_rated, p["w"]
     u = run.path.voltage / span
     reversible = np.sign(u) * np.abs(u) ** (1.0 + p["p"])
-    irreversible = rayleigh(run.path.path_voltage)[run.path.node] / span**2
+    half_squares = with_memory(run.path.path_voltage, lambda distance: 0.5 * distance**2)
+    irreversible = half_squares[run.path.node] / span**2
     return pushed(run, gain * run.stack.k_l * span * ((1.0 - w) * reversible + w * irreversible))
 
 
@@ -317,13 +297,6 @@ def heat(voltage: FloatArray, q: float) -> FloatArray:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def warmed(energy: FloatArray, step: float, tau: float) -> FloatArray:
-    decay = math.exp(-step / tau)
-    power = np.diff(energy) / step
-    warmed = lfilter([1.0 - decay], [1.0, -decay], power)
-    return np.concatenate(([0.0], np.asarray(warmed, dtype=np.float64)))
-
-
 def _heating(d: Draw) -> dict[str, float]:
     """Thermal time constant [s], 0.1-0.5 of the record's length; power q of the loss."""
     return {"tau": d.uniform(0.1, 0.5) * d.length, "q": d.uniform(2.2, 3.2)}
@@ -351,13 +324,10 @@ def self_heating(run: Run, p: Parameters, gain: float) -> FloatArray:
     mean = float(energy[-1]) / float(run.times[-1] - run.times[0])
     if mean == 0.0:
         return np.zeros_like(run.times)
-    warm = warmed(energy / mean, run.fine_step, p["tau"])
-    return gain * warm[:: run.sub_intervals] * run.displacement
-
-
-def cycles(voltage: FloatArray, span: float) -> FloatArray:
-    """Travel of the voltage in full cycles of `span`, (M,) [1]."""
-    return np.concatenate(([0.0], np.cumsum(np.abs(np.diff(voltage))))) / (2.0 * span)
+    decay = math.exp(-run.fine_step / p["tau"])
+    power = np.diff(energy / mean) / run.fine_step
+    warm = np.concatenate(([0.0], lfilter([1.0 - decay], [1.0, -decay], power)))
+    return np.asarray(gain * warm[:: run.sub_intervals] * run.displacement)
 
 
 @hidden(
@@ -374,13 +344,9 @@ def ageing(run: Run, p: Parameters, gain: float) -> FloatArray:
     BaTiO3-based piezoceramics", J. Phys.: Condens. Matter 10 (1998) 9129 (logarithmic law,
     there in time). Not the project's form: the clock is the travel of the voltage.
     """
-    count = cycles(run.path.path_voltage, run.stack.u_rated)[run.path.node][:: run.sub_intervals]
-    return -gain * np.log10(1.0 + count / p["n_0"]) * run.displacement
-
-
-def preisach(voltage: FloatArray, dead_zone: float) -> FloatArray:
-    """R [V^2], (M,)."""
-    return with_memory(voltage, lambda swing: 0.5 * np.maximum(0.0, swing - dead_zone) ** 2)
+    travel = np.concatenate(([0.0], np.cumsum(np.abs(np.diff(run.path.path_voltage)))))
+    cycles = (travel / (2.0 * run.stack.u_rated))[run.path.node][:: run.sub_intervals]
+    return -gain * np.log10(1.0 + cycles / p["n_0"]) * run.displacement
 
 
 @hidden(
@@ -400,5 +366,6 @@ def dead_zone_hysteresis(run: Run, p: Parameters, gain: float) -> FloatArray:
     g is its size over the linear force after a rated swing.
     """
     span, dead_zone = run.stack.u_rated, p["dead_zone"]
-    operator = preisach(run.path.path_voltage, dead_zone)[run.path.node]
+    beyond = lambda swing: 0.5 * np.maximum(0.0, swing - dead_zone) ** 2  # noqa: E731
+    operator = with_memory(run.path.path_voltage, beyond)[run.path.node]
     return pushed(run, gain * run.stack.k_l * span * operator / (0.5 * (span - dead_zone) ** 2))

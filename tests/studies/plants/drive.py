@@ -133,13 +133,6 @@ def voltage_saturation(run: Run, _: Parameters, gain: float) -> Run:
     return follow(run, np.minimum(run.fine_command, (1.0 - gain) * float(run.command.max())))
 
 
-def filtered(command: FloatArray, step: float, constant: float, zeta: float) -> FloatArray:
-    """v_f of a second-order amplifier on the fine grid, (M,) [V]."""
-    damped = math.sqrt(1.0 - zeta**2)
-    pole = complex(-zeta, damped) / constant
-    return first_order(pole, command, step).imag / (constant * damped)
-
-
 @of_drive("T", "s", (2e-5, 4e-3), refit=True, drawn=lambda d: {"zeta": d.uniform(0.7, 0.95)})
 def drive_lag(run: Run, p: Parameters, gain: float) -> Run:
     """An amplifier of second order between command and drive.
@@ -154,12 +147,10 @@ def drive_lag(run: Run, p: Parameters, gain: float) -> Run:
     with a capacitive load; bandwidth 40 Hz to 8 kHz in data sheets. Not the project's form:
     one complex pair, no further state in the balance of the drive.
     """
-    return follow(run, filtered(run.fine_command, run.fine_step, gain, p["zeta"]))
-
-
-def droop(command: FloatArray, step: float, constant: float) -> FloatArray:
-    """The low-pass w of a leak, (M,) [V]."""
-    return first_order(-1.0 / constant + 0j, command, step).real / constant
+    damped = math.sqrt(1.0 - p["zeta"] ** 2)
+    pole = complex(-p["zeta"], damped) / gain
+    passed = first_order(pole, run.fine_command, run.fine_step).imag / (gain * damped)
+    return follow(run, passed)
 
 
 def _leak(d: Draw) -> dict[str, float]:
@@ -180,4 +171,5 @@ def charge_leakage(run: Run, p: Parameters, gain: float) -> Run:
     piezoelectric tube scanners", Rev. Sci. Instrum. 76 (2005) 073707. Not the project's
     form: a mix of the command with its low-pass, no balance of charge.
     """
-    return follow(run, run.fine_command - gain * droop(run.fine_command, run.fine_step, p["t"]))
+    droop = first_order(-1.0 / p["t"] + 0j, run.fine_command, run.fine_step).real / p["t"]
+    return follow(run, run.fine_command - gain * droop)

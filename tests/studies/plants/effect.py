@@ -61,7 +61,7 @@ class HiddenEffect:
     ratio is that of a base fitted again. called: its name in the project's table, where that is
     another one. driven: of an effect before the stack, (run, secondary parameters, gain) -> the run
     behind it. of_sensor: it acts on the reading. With these two, several effects of one record act
-    on each other (`added_by`). random: it is a random signal of its own, which goes on in held-out
+    on each other (`added_by`). random: it is a further random signal, which goes on in held-out
     samples as no model can know.
     """
 

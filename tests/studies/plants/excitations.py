@@ -11,6 +11,7 @@ statically here are no physics there.
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -128,11 +129,8 @@ STAIRCASE_SAMPLES = 12_000
 
 Wave = tuple[float, FloatArray]
 """Sampling rate [Hz] and voltage over the span (N,)."""
-
-
-def draw_design(rng: np.random.Generator, kind: DesignKind) -> Wave:
-    """Draw a record's sampling rate [Hz] and its voltage over the span (N,)."""
-    return _SHAPES_designs[kind](rng)
+Shape = Callable[[np.random.Generator, int], FloatArray]
+"""A voltage over the span with so many samples."""
 
 
 def _blocks(
@@ -203,7 +201,7 @@ def _small(rng: np.random.Generator) -> Wave:
     return rate, float(rng.uniform(0.1, 0.4)) * wave
 
 
-_SHAPES_designs: dict[DesignKind, Callable[[np.random.Generator], Wave]] = {
+_DESIGNED: dict[DesignKind, Callable[[np.random.Generator], Wave]] = {
     "fast": _fast,
     "bipolar": _bipolar,
     "short": _short,
@@ -230,7 +228,7 @@ def draw_excitation(
     if kind == "rich":
         return draw_voltage(rng, span)
     if kind in DESIGNS:
-        rate, wave = draw_design(rng, kind)
+        rate, wave = _DESIGNED[kind](rng)
         return np.arange(wave.size) / rate, _played(span, wave)
     rate, least = RATES_AND_SAMPLES[int(rng.integers(len(RATES_AND_SAMPLES)))]
     count = int(rng.integers(least, 6001))
@@ -259,12 +257,6 @@ def _triangle(rng: np.random.Generator, count: int) -> FloatArray:
     return float(rng.uniform(0.6, 1.0)) * 0.5 * (1.0 + triangle(phase - 0.25))
 
 
-def _steps(rng: np.random.Generator, count: int) -> FloatArray:
-    """Twenty levels, each held for 1 to 8 % of the record."""
-    parts = np.array_split(np.arange(count), 4)
-    return np.concatenate([steps(rng, part.size) for part in parts])
-
-
 def _slow(rng: np.random.Generator, count: int) -> FloatArray:
     """Triangles of three amplitudes, one to two minutes a period, then levels held for half a
     minute.
@@ -279,20 +271,20 @@ def _slow(rng: np.random.Generator, count: int) -> FloatArray:
     return np.concatenate([*waves, steps(rng, held // 2), steps(rng, held - held // 2)])
 
 
-def _loops(rng: np.random.Generator, count: int) -> FloatArray:
-    """Loops at three rates and three amplitudes, four times."""
+def _four_times(shape: Shape, rng: np.random.Generator, count: int) -> FloatArray:
+    """Twenty levels, or loops at three rates and three amplitudes, four times."""
     parts = np.array_split(np.arange(count), 4)
-    return np.concatenate([loops(rng, part.size) for part in parts])
+    return np.concatenate([shape(rng, part.size) for part in parts])
 
 
 def _periods(rng: np.random.Generator, low: float, high: float) -> float:
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
-_SHAPES: dict[str, Callable[[np.random.Generator, int], FloatArray]] = {
+_SHAPES: dict[str, Shape] = {
     "sine": _sine,
     "triangle": _triangle,
-    "steps": _steps,
+    "steps": partial(_four_times, steps),
     "slow": _slow,
-    "loops": _loops,
+    "loops": partial(_four_times, loops),
 }

@@ -127,8 +127,8 @@ def growing_capacitance(truth: Truth, gain: float) -> Truth:
     force = stack.k_l * u + hysteresis_force(stack, path)
     fine = force_to_displacement(stack, force, run.fine_step)
     charge = stack.c_p_el * top / gain * np.expm1(gain * u / top) + stack.k_l * fine
-    x, observed = (q[:: run.sub_intervals] for q in (fine, u))
-    return replace(truth, displacement=x, reading=x, voltage=observed, fine_charge=charge)
+    x, voltage = (q[:: run.sub_intervals] for q in (fine, u))
+    return replace(truth, displacement=x, reading=x, voltage=voltage, fine_charge=charge)
 
 
 def _charge(run: Run) -> FloatArray:

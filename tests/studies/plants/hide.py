@@ -1,4 +1,11 @@
-"""Hide an effect in a base simulation: draw it, scale it until it is as visible as wanted."""
+"""Hide an effect in a base simulation: draw it, scale it until it is as visible as wanted.
+
+    visible ratio = rms(contribution - its least-squares fit by `base_directions`) / sigma
+
+Directions: 1, base displacement, its rate, command, and the derivatives of the base displacement
+with respect to R_s C_p, A, beta, gamma, n, delta and tau (central differences on a coarse grid).
+The first four alone would call an effect visible that a re-fitted hysteresis absorbs.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,21 +13,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
+from scipy.optimize import brentq, least_squares
 
 from tests.studies.plants.base import Run, simulate_base
 from tests.studies.plants.effect import HiddenEffect, Parameters
-from tests.studies.plants.stack import FloatArray
+from tests.studies.plants.stack import FloatArray, Stack
 from tests.studies.plants.table import HIDDEN_EFFECTS
-from tests.studies.plants.visibility import refitted_ratio, visible_ratio
 
 RATIO = (1.5, 4.0)
-"""Visible ratio (tests/studies/plants/visibility.py) that is drawn at strength 1."""
+"""Visible ratio that is drawn."""
 SEARCH = 12
 """Sub-intervals while a gain is searched; the record itself has the full number."""
 WEAK = 0.02
-"""Where a ratio is asked for, gains go down to this share of the smallest that is plausible: that
-one is worth noticing, a weaker one is no less possible.
+"""If a ratio is demanded, gains go down to this share of the smallest that is plausible: a weaker
+one is possible too.
 """
 
 ATTEMPTS, ENOUGH = 4, 1.25
@@ -61,12 +67,11 @@ def hide(
     rng: np.random.Generator,
     directions: FloatArray,
     noise_rms: float,
-    strength: float,
     visible: Visible | None,
     gain: float | None = None,
 ) -> Hidden:
-    """Draw the effect and its gain. strength scales a visible ratio drawn from RATIO; `visible`
-    replaces both, and a `gain` that is known the search for it.
+    """Draw the effect and its gain. `visible` replaces a visible ratio drawn from RATIO, and a
+    known `gain` the search for it.
     """
     parameters = hidden.draw(rng, run)
     if gain is not None:
@@ -77,7 +82,7 @@ def hide(
         low, high = visible
         wanted = math.exp(float(rng.uniform(math.log(low), math.log(high))))
     else:
-        wanted = strength * float(rng.uniform(*RATIO)) if visible is None else float(visible)
+        wanted = float(rng.uniform(*RATIO)) if visible is None else float(visible)
     weakest = hidden.plausible[0] * (1.0 if visible is None else WEAK)
     gains = (weakest, hidden.plausible[1])
     gain, limited = find_gain(hidden, run, parameters, directions, wanted * noise_rms, gains)
@@ -172,3 +177,75 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
         between = CubicSpline(run.times, values)(run.path.time)
         run = replace(run, fine_displacement=run.fine_displacement + between)
     return total
+
+
+COARSE_SUB_INTERVALS = 6
+RELATIVE_STEP = 0.02
+#: Largest change of a parameter in a fit, in its logarithm; residual of a loop that diverges.
+_WIDEST, _DIVERGED = 12.0, 1e6
+FREE = ("r_s", "a", "beta", "gamma", "n", "delta", "tau")
+
+
+def base_directions(run: Run) -> FloatArray:
+    """Orthonormal directions in which the base model can move, (N, 11)."""
+    matrix = base_columns(run.stack, run.times, run.command, run.displacement)
+    return np.asarray(np.linalg.qr(matrix / np.linalg.norm(matrix, axis=0))[0], dtype=np.float64)
+
+
+def base_columns(
+    stack: Stack, times: FloatArray, command: FloatArray, displacement: FloatArray
+) -> FloatArray:
+    """What moves the base's displacement (N,) [m], (N, 11): 1, it, its rate [m/s], the command [V],
+    and the derivatives by the logarithms of FREE [m].
+    """
+
+    def moved(name: str, factor: float) -> FloatArray:
+        changed: Stack = replace(stack, **{name: getattr(stack, name) * factor})
+        return simulate_base(changed, times, command, COARSE_SUB_INTERVALS).displacement
+
+    def derivative(name: str) -> FloatArray:
+        step = RELATIVE_STEP / 2.0
+        return (moved(name, 1.0 + step) - moved(name, 1.0 - step)) / RELATIVE_STEP
+
+    rate = np.gradient(displacement, times)
+    columns = [np.ones_like(displacement), displacement, rate, command]
+    return np.column_stack([*columns, *(derivative(name) for name in FREE)])
+
+
+def visible_ratio(directions: FloatArray, contribution: FloatArray, sigma: float) -> float:
+    """Rms of what is left over the noise's sigma [1]."""
+    left = contribution - directions @ (directions.T @ contribution)
+    return math.sqrt(float(np.mean(left**2))) / sigma
+
+
+def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
+    """As `visible_ratio`, with the base fitted again instead of linearised: what a lag leaves once
+    R_s C_p, tau and the dampings have taken over what they can. A few seconds; coarse grid.
+
+    The dampings' own lags, c_P/k_P and c_B/k_B, may be far below the sampling interval, where no
+    slope leads out: a second fit frees them from half of it.
+    """
+    start = simulate_base(run.stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+
+    def rest(logs: FloatArray) -> FloatArray:
+        # without the dampings' logarithms they stay as they are
+        factors = dict(zip((*FREE, "k_l", "c_p", "c_b"), np.exp(logs).tolist(), strict=False))
+        moved = {name: getattr(run.stack, name) * factor for name, factor in factors.items()}
+        stack: Stack = replace(run.stack, **moved)
+        try:
+            fitted = simulate_base(stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement
+        except OverflowError:  # a loop that diverges explains nothing
+            return np.full(run.times.size, _DIVERGED)
+        left = (contribution + start - fitted) / sigma
+        return np.asarray(left - left.mean(), dtype=np.float64)
+
+    half = 0.5 * float(run.times[1] - run.times[0])
+    lags = run.stack.c_p / run.stack.k_p, run.stack.c_b / run.stack.k_b
+    plain = np.zeros(len(FREE) + 1)
+    damped = np.concatenate([plain, np.clip(np.log(half / np.array(lags)), -_WIDEST, _WIDEST)])
+    bounds = (-_WIDEST - 1.0, _WIDEST + 1.0)
+    costs = [
+        float(least_squares(rest, logs, bounds=bounds, diff_step=[1e-3], max_nfev=12).cost)
+        for logs in (plain, damped)
+    ]
+    return math.sqrt(2.0 * min(costs) / run.times.size)

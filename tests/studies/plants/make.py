@@ -2,18 +2,24 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
-from tests.studies.plants.base import simulate_base
+from tests.studies.plants.base import Run, simulate_base
+from tests.studies.plants.ceramic import heat
 from tests.studies.plants.excitations import EXCITATIONS, ExcitationKind, draw_excitation
-from tests.studies.plants.hide import Hidden, Visible, added_by, effect_called, hide
+from tests.studies.plants.hide import (
+    Hidden,
+    Visible,
+    added_by,
+    base_directions,
+    effect_called,
+    hide,
+)
 from tests.studies.plants.noise import NOISES, Noise, NoiseKind, disturb, draw_noise
 from tests.studies.plants.stack import FloatArray, Stack, draw_stack
-from tests.studies.plants.visibility import base_directions
 
 HEADER = "time [s],voltage [V],displacement [um]"
 THERMOMETER = ",temperature [degC]"
@@ -23,18 +29,16 @@ THERMOMETER = ",temperature [degC]"
 class Truth:
     """What is behind a record.
 
-    effect: the hidden effect or None; foreign: True where the project's table has no such effect.
-    gain and parameters: the effect's own, SI. stack: the base. sigma, quantum: rms of the noise and
-    count of the sensor [m]. visible: rms of what the base cannot absorb over sigma. gain_limited:
-    the gain wanted was beyond the effect's plausible range and was clipped. times, voltage,
-    displacement, base_displacement: (N,) clean [s, V, m], the last without any effect. noise: kind
-    and figures of the noise; lost: (N,) True where a sample is missing or stuck. excitation: class
-    of the voltage. temperature: (N,) [degC] where the record has a thermometer. more: further
-    hidden effects, added to the first.
+    effect: the hidden effect or None. gain and parameters: the effect's own, SI. stack: the base.
+    sigma, quantum: rms of the noise and count of the sensor [m]. visible: rms of what the base
+    cannot absorb over sigma. gain_limited: the gain wanted was beyond the effect's plausible range
+    and was clipped. times, voltage, displacement, base_displacement: (N,) clean [s, V, m], the last
+    without any effect. noise: kind and figures of the noise. excitation: class of the voltage.
+    temperature: (N,) [degC] where the record has a thermometer. more: further hidden effects, added
+    to the first.
     """
 
     effect: str | None
-    foreign: bool
     gain: float
     parameters: Mapping[str, float]
     stack: Stack
@@ -47,7 +51,6 @@ class Truth:
     displacement: FloatArray
     base_displacement: FloatArray
     noise: Noise
-    lost: npt.NDArray[np.bool_]
     excitation: ExcitationKind
     temperature: FloatArray | None
     more: tuple[Hidden, ...]
@@ -63,7 +66,6 @@ def make_record(
     effect: str | None,
     seed: int,
     path: Path,
-    strength: float = 1.0,
     *,
     noise: NoiseKind = "white",
     excitation: ExcitationKind = "rich",
@@ -74,11 +76,11 @@ def make_record(
 ) -> Truth:
     """Write a synthetic record as CSV and return the truth; the same seed gives the same bytes.
 
-    effect: a name of `HIDDEN_EFFECTS` or None. strength scales the drawn visible ratio (1.5 to 4);
-    0 removes the effect; `visible` (a ratio or a range) replaces it, and a `gain` both: where it is
-    known, no search takes its time. The same seed gives the same stack, voltage and noise with
-    every effect, and the same stack with every excitation. more: further effects, each as visible
-    beside the base as `more_visible` says; they act on each other (`added_by`).
+    effect: a name of `HIDDEN_EFFECTS` or None. `visible` (a ratio or a range) replaces the drawn
+    visible ratio (1.5 to 4), and a `gain` both: it needs no search, and 0 removes the effect. The
+    same seed gives the same stack, voltage and noise with every effect, and the same stack with
+    every excitation. more: further effects, each as visible in the base as `more_visible` demands;
+    they act on each other (`added_by`).
     """
     for value, known in ((noise, NOISES), (excitation, EXCITATIONS)):
         if value not in known:
@@ -93,29 +95,27 @@ def make_record(
     bare = chosen is None and not further
     directions = np.empty((run.times.size, 0)) if bare else base_directions(run)
     first = [
-        hide(one, run, effect_rng, directions, kind.rms, strength, visible, gain)
+        hide(one, run, effect_rng, directions, kind.rms, visible, gain)
         for one in (chosen,)
         if one is not None
     ]
     others = tuple(
-        hide(one, run, rng, directions, kind.rms, 1.0, more_visible)
+        hide(one, run, rng, directions, kind.rms, more_visible)
         for one, rng in zip(further, more_rng, strict=True)
     )
     every = [(h.effect, h.parameters, h.gain) for h in (*first, *others)]
     clean = run.displacement + added_by(run, every)
-    read, lost = disturb(noise_rng, kind, clean)
+    read = disturb(noise_rng, kind, clean)
     temperature = None
     for one, parameters, _ in every:
         if one.room is not None:
             temperature = one.room(run.times, parameters)
     write_csv(path, run.times, run.command, read, temperature)
-    displayed = (first[0].gain, first[0].parameters) if first else (0.0, {})
+    gain_and_parameters = (first[0].gain, first[0].parameters) if first else (0.0, {})
     visibility = (first[0].visible, first[0].gain_limited) if first else (0.0, False)
-    foreign = chosen is not None and chosen.foreign
     return Truth(
         effect,
-        foreign,
-        *displayed,
+        *gain_and_parameters,
         stack,
         kind.rms,
         kind.quantum,
@@ -125,7 +125,6 @@ def make_record(
         clean,
         run.displacement,
         kind,
-        lost,
         excitation,
         temperature,
         others,
@@ -156,3 +155,70 @@ def write_csv(
 def make_demo(path: Path) -> Truth:
     """The demonstration's record: a stack that creeps."""
     return make_record("slow_creep", 2015, path)
+
+
+_IN_LENGTHS = ("exponential", "q", "s_1")
+
+
+def in_terms_of(truth: Truth, times: FloatArray, command: FloatArray) -> Truth:
+    """Return the truth whose effect on times (N,) [s] and commands (N,) [V] is the same device's.
+
+    Further effects stay as they are. Three effects are drawn relative to the record that they are
+    hidden in: the drift to its length T, the heating to its mean loss P, the clipping to its
+    highest voltage V. On a record with T', P', V' the same device has
+
+        drift       g' = g T'/T,  c' = c T/T',  q' = q T/T',  s_1' = s_1 T/T',  e' = e
+        heating     g' = g P'/P
+        clipping    (1 - g') V' = (1 - g) V,  no less than 0
+    """
+    if truth.effect == "offset_drift":
+        ratio = _length(times) / _length(truth.times)
+        parameters = {n: v / ratio if n in _IN_LENGTHS else v for n, v in truth.parameters.items()}
+        return replace(truth, gain=truth.gain * ratio, parameters=parameters)
+    if truth.effect == "self_heating":
+        losses = [
+            _mean_loss(simulate_base(truth.stack, t, v), truth.parameters)
+            for t, v in ((truth.times, truth.voltage), (times, command))
+        ]
+        return replace(truth, gain=truth.gain * losses[1] / losses[0])
+    if truth.effect == "voltage_saturation":
+        ends = (1.0 - truth.gain) * float(truth.voltage.max())
+        return replace(truth, gain=max(0.0, 1.0 - ends / float(command.max())))
+    return truth
+
+
+def _length(times: FloatArray) -> float:
+    return float(times[-1] - times[0])
+
+
+def _mean_loss(run: Run, parameters: Mapping[str, float]) -> float:
+    """Return what the plant's temperature is divided by [V^q/s]."""
+    energy: FloatArray = heat(run.path.path_voltage, parameters["q"])[run.path.node]
+    return float(energy[-1]) / float(np.ptp(run.times))
+
+
+def play_again(
+    truth: Truth,
+    seed: int,
+    path: Path,
+    played: tuple[FloatArray, FloatArray] | None = None,
+) -> FloatArray:
+    """Write a further record of a device and return its displacement without noise, (N,) [m].
+
+    `truth` is the device: its stack, its effects with their gains (`in_terms_of` the new record),
+    the kind of its noise. `played`
+    are uniform times (N,) [s] and commands (N,) [V], beginning at 0 V; else a voltage of the class
+    of the first record is drawn. The seed decides what is drawn, and the noise.
+    """
+    rng = np.random.default_rng([seed, 2])
+    times, command = played or draw_excitation(rng, truth.excitation, truth.stack.u_rated)
+    truth = in_terms_of(truth, times, command)
+    run = simulate_base(truth.stack, times, command)
+    effects = [(effect_called(name), p, gain) for name, p, gain in truth.hidden]
+    clean, temperature = run.displacement + added_by(run, effects), None
+    for effect, parameters, _ in effects:
+        if effect.room is not None:
+            temperature = effect.room(times, parameters)
+    read = disturb(rng, truth.noise, clean)
+    write_csv(path, times, command, read, temperature)
+    return clean

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from tests.studies.plants.base import Run, first_order
 from tests.studies.plants.ceramic import play
 from tests.studies.plants.effect import Draw, Parameters, hidden
-from tests.studies.plants.stack import FloatArray, Stack
+from tests.studies.plants.stack import FloatArray
 
 
 def _mode(d: Draw) -> dict[str, float]:
@@ -70,13 +70,6 @@ def load_stiffness(run: Run, p: Parameters, gain: float) -> FloatArray:
     return balance(run.displacement, p["length"], gain) - run.displacement
 
 
-def contact(free: FloatArray, place: float, side: float, stiffness: float) -> FloatArray:
-    """Displacement lost to the contact, (N,) [m]; 0 at x_free = 0."""
-    share = stiffness / (1.0 + stiffness)
-    reach = np.maximum(0.0, side * (free - place)) - max(0.0, -side * place)
-    return np.asarray(side * share * reach, dtype=np.float64)
-
-
 @hidden("g", "1", (1e-3, 1.0), drawn=lambda d: {"x_0": d.place(0.3, 0.7), "side": d.sign()})
 def preload_loss(run: Run, p: Parameters, gain: float) -> FloatArray:
     """A preload that is lost on one side of a position.
@@ -91,7 +84,9 @@ def preload_loss(run: Run, p: Parameters, gain: float) -> FloatArray:
     K. L. Johnson, "Contact Mechanics". Not the project's form: the corner is not smoothed,
     and the equation is algebraic.
     """
-    return -contact(run.displacement, p["x_0"], p["side"], gain)
+    place, side = p["x_0"], p["side"]
+    reach = np.maximum(0.0, side * (run.displacement - place)) - max(0.0, -side * place)
+    return np.asarray(-(side * (gain / (1.0 + gain)) * reach))
 
 
 @hidden("g", "m", (1e-9, 3e-6))
@@ -221,15 +216,6 @@ def _band(rng: np.random.Generator, times: FloatArray, frequency: float, q: floa
 _LINES = 12
 
 
-def neighbour(times: FloatArray, parameters: Parameters) -> FloatArray:
-    """w, (N,) [1]."""
-    rng = np.random.default_rng(int(parameters["seed"]))
-    frequency = rng.uniform(parameters["f_1"], parameters["f_2"], _LINES)
-    phase = rng.uniform(0.0, 2.0 * math.pi, _LINES)
-    waves = np.sin(2.0 * math.pi * np.outer(frequency, times) + phase[:, None])
-    return np.asarray(waves.sum(axis=0) / math.sqrt(0.5 * _LINES), dtype=np.float64)
-
-
 def _stage(d: Draw) -> dict[str, float]:
     """Band [Hz], threshold r and share a of the play, seed of frequencies and phases."""
     return {
@@ -249,17 +235,12 @@ def cross_axis(run: Run, p: Parameters, gain: float) -> FloatArray:
     play operator. Source: crosstalk of parallel-kinematic stages, e.g. Y. K. Yong, S. O. R.
     Moheimani, B. J. Kenton and K. K. Leang, Rev. Sci. Instrum. 83 (2012) 121101.
     """
-    w = neighbour(run.times, p)
+    rng = np.random.default_rng(int(p["seed"]))
+    frequency = rng.uniform(p["f_1"], p["f_2"], _LINES)
+    phase = rng.uniform(0.0, 2.0 * math.pi, _LINES)
+    waves = np.sin(2.0 * math.pi * np.outer(frequency, run.times) + phase[:, None])
+    w: FloatArray = waves.sum(axis=0) / math.sqrt(0.5 * _LINES)
     return gain * (w - p["a"] * (w - play(w, p["r"], float(w[0]))))
-
-
-def matrices(s: Stack) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M [kg], C [N.s/m] and K [N/m] of (y, x), (2, 2) each."""
-    mass = np.diag([s.m_p, s.m_b])
-    damping, stiffness = (
-        np.array([[p + b, -b], [-b, b]]) for p, b in ((s.c_p, s.c_b), (s.k_p, s.k_b))
-    )
-    return mass, damping, stiffness
 
 
 def two_masses(run: Run, load: FloatArray | None = None) -> FloatArray:
@@ -278,15 +259,19 @@ def two_masses(run: Run, load: FloatArray | None = None) -> FloatArray:
     Displacement x at the samples, (N,) [m], for the force of a run of the base; load: force
     on the output mass at the samples, (N,) [N], linear in between.
     """
-    mass, damping, stiffness = matrices(run.stack)
+    s = run.stack
+    mass = np.diag([s.m_p, s.m_b])
+    damping, stiffness = (
+        np.array([[p + b, -b], [-b, b]]) for p, b in ((s.c_p, s.c_b), (s.k_p, s.k_b))
+    )
     a = np.zeros((5, 5))
     a[:2, 2:4] = np.eye(2)
     a[2:4, :2] = -np.linalg.solve(mass, stiffness)
     a[2:4, 2:4] = -np.linalg.solve(mass, damping)
-    a[2, 4] = 1.0 / run.stack.m_p
-    a[4, 4] = -1.0 / run.stack.tau
+    a[2, 4] = 1.0 / s.m_p
+    a[4, 4] = -1.0 / s.tau
     b = np.zeros((5, 2))
-    b[4, 0], b[3, 1] = 1.0 / run.stack.tau, 1.0 / run.stack.m_b
+    b[4, 0], b[3, 1] = 1.0 / s.tau, 1.0 / s.m_b
     pushed = np.zeros_like(run.times) if load is None else load
     fine = np.interp(np.arange(run.force.size) / run.sub_intervals, np.arange(pushed.size), pushed)
     x = linear_response(a, b, np.column_stack([run.force, fine]), run.fine_step)[:, 1]

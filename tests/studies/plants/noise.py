@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import lfilter
 
 from tests.studies.plants.stack import FloatArray
@@ -48,10 +47,8 @@ def draw_noise(rng: np.random.Generator, kind: NoiseKind, span: float) -> Noise:
     return Noise(kind, white, quantum, white)
 
 
-def disturb(
-    rng: np.random.Generator, noise: Noise, clean: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """What the sensor reports, (N,) [m], nan where nothing came, and where a reading was lost."""
+def disturb(rng: np.random.Generator, noise: Noise, clean: FloatArray) -> FloatArray:
+    """What the sensor reports, (N,) [m], nan where nothing came."""
     error = noise.white * rng.standard_normal(clean.size)
     if noise.correlation > 0.0:
         error = coloured(error, noise.correlation)
@@ -61,9 +58,9 @@ def disturb(
         first = int(rng.integers(1, clean.size - RUN))
         lost[first : first + int(rng.integers(1, RUN + 1))] = True
     if not noise.stuck:
-        return np.where(lost, np.nan, read), lost
+        return np.where(lost, np.nan, read)
     last = np.maximum.accumulate(np.where(lost, 0, np.arange(clean.size)))
-    return read[last], lost
+    return read[last]
 
 
 def coloured(white: FloatArray, correlation: float) -> FloatArray:

@@ -223,14 +223,6 @@ def temperature(run: Run, p: Parameters, gain: float) -> FloatArray:
     return np.asarray(gain * frame * (1.0 + p["b"] * run.displacement / p["span"]), np.float64)
 
 
-def upper(x: FloatArray, level: float, half: float) -> FloatArray:
-    """1 in the upper range, 0 in the lower one, (N,); starts in the lower range."""
-    decided = (x > level + half) | (x < level - half)
-    last = np.maximum.accumulate(np.where(decided, np.arange(x.size), -1))
-    state = (last >= 0) & (x[np.maximum(last, 0)] > level)
-    return np.asarray(state, dtype=np.float64)
-
-
 @hidden(
     "g", "1", (1e-4, 0.03), linear=True, foreign=True, of_sensor=True,
     drawn=lambda d: {"level": d.place(0.35, 0.65), "half": d.uniform(0.02, 0.06) * d.span},
@@ -248,17 +240,11 @@ def range_switch(run: Run, p: Parameters, gain: float) -> FloatArray:
 
     Above 1 % only where the base absorbs most of it.
     """
-    return gain * run.displacement * upper(run.displacement, p["level"], p["half"])
-
-
-def flicker(times: FloatArray, constant: float, seed: int) -> FloatArray:
-    """n at the samples, (N,) [1], stationary from the start, scaled to rms 1 and mean 0."""
-    rng = np.random.default_rng(seed)
-    decay = math.exp(-float(times[1] - times[0]) / constant)
-    noise = rng.standard_normal(2 * times.size)
-    slow = np.asarray(lfilter([1.0], [1.0, -2.0 * decay, decay**2], noise))[times.size :]
-    slow = slow - slow.mean()
-    return np.asarray(slow / np.std(slow), dtype=np.float64)
+    x, level, half = run.displacement, p["level"], p["half"]
+    decided = (x > level + half) | (x < level - half)
+    last = np.maximum.accumulate(np.where(decided, np.arange(x.size), -1))
+    upper = (last >= 0) & (x[np.maximum(last, 0)] > level)  # starts in the lower range
+    return np.asarray(gain * x * upper)
 
 
 def _source(d: Draw) -> dict[str, float]:
@@ -277,7 +263,11 @@ def source_power(run: Run, p: Parameters, gain: float) -> FloatArray:
     it vanishes at x = 0, so it is no drift. Source: relative intensity noise of diodes in
     reflective sensors, e.g. K. Petermann, "Laser Diode Modulation and Noise".
     """
-    return gain * flicker(run.times, p["t"], int(p["seed"])) * run.displacement
+    decay = math.exp(-float(run.times[1] - run.times[0]) / p["t"])
+    noise = np.random.default_rng(int(p["seed"])).standard_normal(2 * run.times.size)
+    slow = np.asarray(lfilter([1.0], [1.0, -2.0 * decay, decay**2], noise))[run.times.size :]
+    slow = slow - slow.mean()
+    return np.asarray(gain * (slow / np.std(slow)) * run.displacement)
 
 
 def held(run: Run, renewals: int, skew: float, first: float) -> FloatArray:
@@ -298,5 +288,5 @@ def held(run: Run, renewals: int, skew: float, first: float) -> FloatArray:
     period = step * (1.0 - skew) / renewals
     start = (first - 1.0) * period
     instants = start + period * np.floor((run.times - start) / period)
-    displayed = CubicSpline(run.path.time, run.fine_displacement)(np.maximum(instants, 0.0))
-    return np.asarray(displayed, dtype=np.float64)
+    taken = CubicSpline(run.path.time, run.fine_displacement)(np.maximum(instants, 0.0))
+    return np.asarray(taken, dtype=np.float64)

@@ -80,5 +80,5 @@ def table_command(
         for method in METHODS:
             answer_all(data, Path(name) / method, method, 2, progress)
             for figure, value in score.score(data, Path(name) / method)["figures"].items():
-                rows.setdefault(figure, {"figure": figure})[method] = score.shown(value)
+                rows.setdefault(figure, {"figure": figure})[method] = score.formatted(value)
     show_table(TitledTable("Hidden causes", list(rows.values())).table)

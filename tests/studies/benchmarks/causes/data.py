@@ -24,19 +24,17 @@ from tests.studies.benchmarks.hidden_cases import (
     how_made,
 )
 from tests.studies.benchmarks.table import on_all_cores
-from tests.studies.plants.again import play_again
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import draw_excitation
-from tests.studies.plants.hide import SEARCH
-from tests.studies.plants.make import Truth, make_record
+from tests.studies.plants.hide import FREE, SEARCH, base_columns
+from tests.studies.plants.make import Truth, make_record, play_again
 from tests.studies.plants.sensor import room, temperature
 from tests.studies.plants.table import FOREIGN, KNOWN, called
-from tests.studies.plants.visibility import FREE, base_columns
 
 #: Shares of the kinds of cases; what is left over goes to the first.
 SHARES = {"known": 0.5, "clean": 0.2, "foreign": 0.1, "weak": 0.1, "two": 0.1}
-#: A lag of the sensor is taken over by the base's own: no gain makes it visible.
-ASKED = tuple(name for name in KNOWN if name != "sensor_lag")
+#: The base model absorbs a lag of the sensor: no gain makes it visible.
+VISIBLE = tuple(name for name in KNOWN if name != "sensor_lag")
 #: Drawn relative to their record (`in_terms_of`), which knows the first effect only.
 _FIRST_ONLY = ("offset_drift", "self_heating", "voltage_saturation")
 #: Draws of one effect before the next one takes its place.
@@ -58,29 +56,29 @@ class Half(NamedTuple):
 
 
 def cases_of(seed: int, count: int) -> list[Case]:
-    """Return so many cases in the order of the data set, which tells nothing of their kinds."""
+    """Return so many cases in the order of the data set, which is random."""
     rng = np.random.default_rng(seed)
     numbers = {kind: round(share * count) for kind, share in SHARES.items()}
     numbers["known"] += count - sum(numbers.values())
-    known, foreign = (_in_turn(rng, names, count) for names in (ASKED, FOREIGN))
-    weak, pairs = _in_turn(rng, ASKED, count), [_pair(rng) for _ in range(numbers["two"])]
+    known, foreign = (_in_turn(rng, names, count) for names in (VISIBLE, FOREIGN))
+    weak, pairs = _in_turn(rng, VISIBLE, count), [_pair(rng) for _ in range(numbers["two"])]
     seeds = iter(np.random.SeedSequence(seed).generate_state(count).tolist())
     cases = []
     for kind, number in numbers.items():
         for k in range(number):
-            item = next(seeds)
+            case_seed = next(seeds)
             match kind:
                 case "known":
-                    cases.append(Case("known", known[k], item, noise=NOISES[k % len(NOISES)]))
+                    cases.append(Case("known", known[k], case_seed, noise=NOISES[k % len(NOISES)]))
                 case "clean":
-                    cases.append(Case("clean", None, item, noise=NOISES[k % 2]))
+                    cases.append(Case("clean", None, case_seed, noise=NOISES[k % 2]))
                 case "foreign":
-                    cases.append(Case("foreign", foreign[k], item))
+                    cases.append(Case("foreign", foreign[k], case_seed))
                 case "weak":
-                    cases.append(Case("weak", weak[k], item, WEAK))
+                    cases.append(Case("weak", weak[k], case_seed, WEAK))
                 case _:
                     one, more = pairs[k]
-                    cases.append(Case("two", one, item, STRONG, (more,)))
+                    cases.append(Case("two", one, case_seed, STRONG, (more,)))
     return [cases[k] for k in rng.permutation(count)]
 
 
@@ -90,14 +88,14 @@ def _in_turn(rng: np.random.Generator, names: tuple[str, ...], count: int) -> li
 
 
 def _pair(rng: np.random.Generator) -> tuple[str, str]:
-    more = str(rng.choice([name for name in ASKED if name not in _FIRST_ONLY]))
-    return str(rng.choice([name for name in ASKED if name != more])), more
+    more = str(rng.choice([name for name in VISIBLE if name not in _FIRST_ONLY]))
+    return str(rng.choice([name for name in VISIBLE if name != more])), more
 
 
 def write_case(folder: Path, number: int, case: Case) -> tuple[str, dict[str, object]]:
     """Make and write one case; return its name and its truth.
 
-    Where a device does not show what is hidden as well as was asked for, another one is drawn, and
+    If what is hidden is not as visible as the case demands, another device is drawn, and
     after three of them the next effect is taken.
     """
     seeds = np.random.SeedSequence(case.seed).generate_state(4 * _ATTEMPTS).tolist()
@@ -126,22 +124,27 @@ def write_case(folder: Path, number: int, case: Case) -> tuple[str, dict[str, ob
 def _later(effect: str | None, steps: int) -> str | None:
     if effect is None or steps == 0:
         return effect
-    names = FOREIGN if effect in FOREIGN else ASKED
+    names = FOREIGN if effect in FOREIGN else VISIBLE
     return names[(names.index(effect) + steps) % len(names)]
 
 
 def _halves(case: Case, truth: Truth, path: Path) -> tuple[Half, Half]:
-    """Return the record that is at a path, and the held-out one."""
-    rng = np.random.default_rng([case.seed, 3])
+    """Return the record at a path, and the held-out one; the base is fitted to the first."""
+    rng, again = np.random.default_rng([case.seed, 3]), path.with_name("holdout.csv")
     walk = _thermometer(truth, rng)
-    played = draw_excitation(rng, truth.excitation, truth.stack.u_rated)
-    first = truth.times, truth.voltage, _read(path), truth.displacement
-    again = path.with_name("holdout.csv")
-    clean = play_again(truth, case.seed + 1, again, played)
-    record = _half(truth, first, truth.base_displacement, walk, None)
-    base = simulate_base(truth.stack, *played).displacement
-    fitted = _fitted(record, truth.base_displacement)
-    return record, _half(truth, (*played, _read(again), clean), base, walk, fitted)
+    times, voltage = draw_excitation(rng, truth.excitation, truth.stack.u_rated)
+    clean = play_again(truth, case.seed + 1, again, (times, voltage))
+    first, base = truth.base_displacement, simulate_base(truth.stack, times, voltage).displacement
+    columns = base_columns(truth.stack, truth.times, truth.voltage, first)
+    later = base_columns(truth.stack, times, voltage, base)
+    read = _read(path)
+    moves = _fitted(columns, read - first)
+    return Half(
+        truth.times, truth.voltage, read, truth.displacement, room(truth.times, walk),
+        first + columns @ moves, columns,
+    ), Half(
+        times, voltage, _read(again), clean, room(times, walk), base + later @ moves, later
+    )  # fmt: skip
 
 
 def _thermometer(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
@@ -153,37 +156,19 @@ def _thermometer(truth: Truth, rng: np.random.Generator) -> dict[str, float]:
 
 
 def _read(path: Path) -> FloatArray:
-    """Return what the sensor said, (N,) [m], nan where nothing."""
+    """Return the readings of the sensor, (N,) [m], nan where one is missing."""
     table = np.genfromtxt(path, delimiter=",", skip_header=1)
     return 1e-6 * np.asarray(table[:, 2], dtype=np.float64)
 
 
-def _half(
-    truth: Truth,
-    signals: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    base: FloatArray,
-    walk: dict[str, float],
-    fitted: FloatArray | None,
-) -> Half:
-    """Return a record with its base, which is fitted to it unless the fit is given."""
-    times, voltage, read, clean = signals
-    columns = base_columns(truth.stack, times, voltage, base)
-    bare = Half(times, voltage, read, clean, room(times, walk), base, columns)
-    moves = _fitted(bare, base) if fitted is None else fitted
-    return bare._replace(base=base + columns @ moves)
+def _fitted(columns: FloatArray, rest: FloatArray) -> FloatArray:
+    """Return the Gauss-Newton step of the base from the device's values, (11,)."""
+    there, size = np.isfinite(rest), np.linalg.norm(columns, axis=0)
+    step = np.linalg.lstsq((columns / size)[there], rest[there], rcond=1e-8)[0]
+    return np.asarray(step / size, dtype=np.float64)
 
 
-def _fitted(half: Half, base: FloatArray) -> FloatArray:
-    """Return the Gauss-Newton step of the base from the device's own values, (11,)."""
-    output = np.isfinite(half.read)
-    size = np.linalg.norm(half.columns, axis=0)
-    result = np.linalg.lstsq((half.columns / size)[output], (half.read - base)[output], rcond=1e-8)[
-        0
-    ]
-    return np.asarray(result / size, dtype=np.float64)
-
-
-#: Letters of the equations beside the parameters.
+#: Letters of the equations that are no parameters.
 LETTERS = {
     "v": "voltage that is applied, the column `voltage` [V]",
     "u": "voltage on the stack [V]",
@@ -282,13 +267,13 @@ def write_model(folder: Path) -> None:
 
 
 def _write_halves(folder: Path, name: str, record: Half, held: Half) -> None:
-    item = folder / "cases" / name
-    _table(item / "record.csv", record, displacement=record.read)
-    _table(item / "holdout.csv", held)
-    _table(item / "base_record.csv", record, base_displacement=record.base)
-    _table(item / "base_holdout.csv", held, base_displacement=held.base)
+    case = folder / "cases" / name
+    _table(case / "record.csv", record, displacement=record.read)
+    _table(case / "holdout.csv", held)
+    _table(case / "base_record.csv", record, base_displacement=record.base)
+    _table(case / "base_holdout.csv", held, base_displacement=held.base)
     np.savez(
-        item / "base.npz", names=np.array(COLUMNS), record=record.columns.astype(np.float32),
+        case / "base.npz", names=np.array(COLUMNS), record=record.columns.astype(np.float32),
         holdout=held.columns.astype(np.float32),
     )  # fmt: skip
     true = {"displacement": held.read, "displacement_without_noise": held.clean}

@@ -4,8 +4,8 @@ An outside method is PySINDy's sparse regression of what the fitted base leaves.
 
 Discrepancy modelling (Kaheman, Kaiser, Strom, Kutz and Brunton 2019, "Learning discrepancy models
 from experimental data") with sequentially thresholded least squares. Each term of the library
-belongs to a cause of the list; what moves the base's own parameters is projected out first. As the
-effects are as small as the noise, the residual itself is regressed and not its derivative.
+belongs to a cause of the list; the directions of the base's parameters are projected out first. As
+the effects are as small as the noise, the residual itself is regressed and not its derivative.
 `pip install pysindy`.
 """
 
@@ -36,7 +36,7 @@ def write_answer(method: str, answers: Path, data: Path, name: str) -> str:
         "format": FORMAT,
         "case": name,
         "detected": detected,
-        "causes": [{e: round(p, 6) for e, p in item.items()} for item in sets],
+        "causes": [{e: round(p, 6) for e, p in s.items()} for s in sets],
         "displacement_um": np.round(1e6 * predicted, 6).tolist(),
         "seconds": round(time.process_time() - begin, 2),
     }
@@ -68,20 +68,20 @@ def by_psa(case: Path) -> Answer:
 
 
 def _sets(d: psa.StackDiagnosis) -> Sets:
-    """Return each named cause with what it cannot be told from, and their probabilities.
+    """Return each named cause and what cannot be distinguished from it, with probabilities.
 
-    The first step's candidates have theirs; a later cause has its confidence, and what it cannot be
-    told from shares the rest.
+    Candidates of the first step have a probability. A later cause has its confidence, and what
+    cannot be distinguished from it shares the rest.
     """
     table = {c.effect: c.probability for c in d.candidates}
     sets = []
     for k, cause in enumerate(d.causes):
         rest = max(0.0, 1.0 - cause.confidence) / max(1, len(cause.cannot_be_told_from))
-        item = {cause.effect: cause.confidence}
+        one_set = {cause.effect: cause.confidence}
         for other in cause.cannot_be_told_from:
-            item[other] = max(_LEAST, min(rest, table.get(other, rest) if k == 0 else rest))
-        over = max(1.0, sum(item.values()))
-        sets.append({e: p / over for e, p in item.items()})
+            one_set[other] = max(_LEAST, min(rest, table.get(other, rest) if k == 0 else rest))
+        over = max(1.0, sum(one_set.values()))
+        sets.append({e: p / over for e, p in one_set.items()})
     return sets
 
 
@@ -106,7 +106,7 @@ def _run(model: psa.Model, case: Path) -> FloatArray:
 #: Chosen on the data set of seed 4711: threshold over the residual's rms, and the least that a
 #: cause lowers Schwarz's criterion.
 THRESHOLD, LEAST = 0.1, 30.0
-#: A cause within so much of Schwarz's criterion of the best cannot be told from it.
+#: A cause within so much of Schwarz's criterion of the best cannot be distinguished from it.
 _NEAR = 6.0
 Library = dict[str, list[FloatArray]]
 

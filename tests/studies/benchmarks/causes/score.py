@@ -1,7 +1,7 @@
 """Score answers to the data set of hidden causes: python score.py DATA ANSWERS [--json FILE]
 
 Needs numpy and nothing else. A case without an answer counts as nothing detected. Malformed answers
-are told in sentences, and nothing is scored: exit code 2.
+are listed in sentences, and nothing is scored: exit code 2.
 """
 
 import itertools
@@ -21,7 +21,7 @@ CLASSES = (0.02, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 
 def column(path, name):
-    """Return the column of a CSV whose heading begins with a name, (N,), nan where empty."""
+    """Return the column of a CSV whose heading starts with a name, (N,), nan where empty."""
     heads = path.read_text(encoding="utf-8").split("\n", 1)[0].split(",")
     at = [h.split(" [")[0] for h in heads].index(name)
     return np.genfromtxt(path, delimiter=",", skip_header=1, usecols=at)
@@ -35,43 +35,46 @@ def faults(answer, name, causes, samples):
     """Return what is wrong with an answer, in sentences; `samples`: of the held-out record."""
     if not isinstance(answer, dict) or answer.get("format") != FORMAT:
         return [f'{name}: the format is not \'{FORMAT}\'; write "format": "{FORMAT}".']
-    items = []
+    wrong = []
     if answer.get("case") != name:
-        items.append(f'{name}: "case" is {answer.get("case")!r}; it must be the file\'s name.')
+        wrong.append(f'{name}: "case" is {answer.get("case")!r}; it must be the file\'s name.')
     if not isinstance(answer.get("detected"), bool):
-        items.append(f'{name}: "detected" must be true or false.')
+        wrong.append(f'{name}: "detected" must be true or false.')
     sets = answer.get("causes")
     if not isinstance(sets, list) or not all(isinstance(s, dict) and s for s in sets):
-        return [*items, f'{name}: "causes" must be a list of objects, each {{cause: probability}}.']
-    for item in sets:
-        items += [
+        return [*wrong, f'{name}: "causes" must be a list of objects, each {{cause: probability}}.']
+    for one_set in sets:
+        wrong += [
             f"{name}: there is no cause '{c}'; data.json lists them."
-            for c in item
+            for c in one_set
             if c not in causes
         ]
-        if not all(_number(p) and 0 <= p <= 1 for p in item.values()) or sum(item.values()) > 1.001:
-            items.append(f"{name}: probabilities of a set lie in 0 to 1 and add up to at most 1.")
+        if (
+            not all(_number(p) and 0 <= p <= 1 for p in one_set.values())
+            or sum(one_set.values()) > 1.001
+        ):
+            wrong.append(f"{name}: probabilities of a set lie in 0 to 1 and add up to at most 1.")
     y = answer.get("displacement_um")
     if y is not None and not (
         isinstance(y, list) and len(y) == samples and all(_number(v) for v in y)
     ):
-        items.append(f'{name}: "displacement_um" must hold {samples} numbers, as holdout.csv.')
-    return [*items, *_more_faults(answer, name)]
+        wrong.append(f'{name}: "displacement_um" must hold {samples} numbers, as holdout.csv.')
+    return [*wrong, *_more_faults(answer, name)]
 
 
 def _more_faults(answer, name):
-    items = []
+    wrong = []
     gain, patch = answer.get("gain_percent"), answer.get("patch")
     if gain is not None and not (
         isinstance(gain, dict) and all(_number(gain.get(k)) for k in ("value", "low", "high"))
     ):
-        items.append(f'{name}: "gain_percent" must hold the numbers value, low and high.')
+        wrong.append(f'{name}: "gain_percent" must hold the numbers value, low and high.')
     if patch is not None and not _is_curve(patch):
-        items.append(
+        wrong.append(
             f'{name}: "patch" must hold "column" (time, voltage, temperature or base'
             ' displacement) and as many increasing "at" as "adds_um".'
         )
-    return items
+    return wrong
 
 
 def _is_curve(patch):
@@ -89,31 +92,29 @@ def read(data, answers):
     """Return truth, answers and causes; print what is wrong with answers and exit."""
     about = json.loads((data / "data.json").read_text(encoding="utf-8"))
     truth = json.loads((data / "truth" / "truth.json").read_text(encoding="utf-8"))["cases"]
-    result, statement = {}, []
+    contents, wrong = {}, []
     if not answers.is_dir():
-        statement.append(
-            f"{answers} is no folder; give the one with your answers, 001.json and so on."
-        )
+        wrong.append(f"{answers} is no folder; give the one with your answers, 001.json and so on.")
     for path in sorted(answers.glob("*.json")):
         if path.stem not in truth:
-            statement.append(f"{path.name}: the data set has no such case.")
+            wrong.append(f"{path.name}: the data set has no such case.")
             continue
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            statement.append(f"{path.name} is no JSON: {error}.")
+            wrong.append(f"{path.name} is no JSON: {error}.")
             continue
         samples = column(data / "truth" / f"{path.stem}.csv", "time").size
-        statement += faults(content, path.stem, about["causes"], samples)
-        result[path.stem] = content
-    if statement:
-        print("\n".join(statement), file=sys.stderr)
+        wrong += faults(content, path.stem, about["causes"], samples)
+        contents[path.stem] = content
+    if wrong:
+        print("\n".join(wrong), file=sys.stderr)
         raise SystemExit(2)
-    return truth, result, about["causes"]
+    return truth, contents, about["causes"]
 
 
 def held_out(data, name, answer):
-    """Return rms on the held-out record of prediction, base and noise [um]; nan if none is given.
+    """Return rms on the held-out record of prediction, base and noise [um]; nan if there is none.
 
     The mean of an error is the zero of the sensor and does not count.
     """
@@ -131,7 +132,7 @@ def held_out(data, name, answer):
 def one(data, name, true, answer):
     """Return the marks of one case."""
     sets = answer.get("causes", [])
-    within = {c for item in sets for c in item}
+    within = {c for one_set in sets for c in one_set}
     error, base, noise = held_out(data, name, answer)
     hidden, gain = true["hidden"], answer.get("gain_percent")
     alone = next(iter(sets[0])) if len(sets) == 1 and len(sets[0]) == 1 else None
@@ -141,7 +142,7 @@ def one(data, name, true, answer):
         "answered": bool(answer), "detected": bool(answer.get("detected")), "named": bool(sets),
         "in_set": set(hidden) <= within, "right_alone": len(hidden) == 1 and alone == hidden[0],
         "single_wrong": alone is not None and alone not in hidden,
-        "exactly": sorted(max(item, key=item.get) for item in sets) == sorted(hidden),
+        "exactly": sorted(max(s, key=s.get) for s in sets) == sorted(hidden),
         "size": len(sets[0]) if len(sets) == 1 else None,
         "over_noise": error / noise, "base_over_noise": base / noise,
         "removed": (base**2 - error**2) / (base**2 - noise**2) if base > noise else np.nan,
@@ -168,11 +169,11 @@ def reliability(marks):
     pairs = [(p, c in m["hidden"]) for m in marks for c, p in m["stated"].items()]
     rows = []
     for low, high in itertools.pairwise(CLASSES):
-        items = [(p, right) for p, right in pairs if low < p <= high + 1e-9]
-        if items:
-            mean = float(np.mean([p for p, _ in items]))
+        inside = [(p, right) for p, right in pairs if low < p <= high + 1e-9]
+        if inside:
+            mean = float(np.mean([p for p, _ in inside]))
             rows.append({"above": low, "up_to": high, "mean": mean,
-                         "right": sum(r for _, r in items), "of": len(items)})  # fmt: skip
+                         "right": sum(r for _, r in inside), "of": len(inside)})  # fmt: skip
     return rows
 
 
@@ -187,12 +188,12 @@ def figures(marks):
         [m for m in marks if m["kind"] == k] for k in ("known", "weak", "clean", "foreign", "two")
     )
     straight = [m for m in known if m["hidden"][0] not in BENDS]
-    items = [m for m in marks if m["gain_held"] is not None]
+    gained = [m for m in marks if m["gain_held"] is not None]
     listed = [*known, *weak, *clean, *foreign]
     predicted = [*known, *weak, *two]
 
-    def count(item, key, wanted=True):
-        return [sum(m[key] == wanted for m in item), len(item)]
+    def count(cases, key, wanted=True):
+        return [sum(m[key] == wanted for m in cases), len(cases)]
 
     return {
         "answered": count(marks, "answered"),
@@ -215,20 +216,20 @@ def figures(marks):
         "the fitted base's, median": _quantile([m["base_over_noise"] for m in predicted], 0.5),
         "clean: held-out error over the noise, median": _quantile([m["over_noise"] for m in clean], 0.5),
         "foreign: share of the excess removed, median": _quantile([m["removed"] for m in foreign], 0.5),
-        "interval of the gain holds it": count(items, "gain_held"),
+        "interval of the gain holds it": count(gained, "gain_held"),
         "seconds of a case, median": _quantile([m["seconds"] for m in marks], 0.5),
     }  # fmt: skip
 
 
 def score(data: Path, answers: Path) -> dict[str, Any]:
     """Return figures, reliability and the marks of every case."""
-    truth, result, _ = read(data, answers)
-    marks = [one(data, name, true, result.get(name, {})) for name, true in truth.items()]
+    truth, contents, _ = read(data, answers)
+    marks = [one(data, name, true, contents.get(name, {})) for name, true in truth.items()]
     single = [m for m in marks if m["kind"] != "two"]
     return {"figures": figures(marks), "reliability": reliability(single), "cases": marks}
 
 
-def shown(value: Any) -> str:
+def formatted(value: Any) -> str:
     """Return a figure as text."""
     if value is None:
         return "-"
@@ -249,10 +250,10 @@ def main(words):
         return 2
     result = score(Path(words[0]), Path(words[1]))
     for name, value in result["figures"].items():
-        print(f"{name:48s} {shown(value)}")
+        print(f"{name:48s} {formatted(value)}")
     for r in result["reliability"]:
         print(f"stated {r['above']:.2f} to {r['up_to']:.2f} (mean {r['mean']:.2f}):"
-              f" {shown([r['right'], r['of']])} right")  # fmt: skip
+              f" {formatted([r['right'], r['of']])} right")  # fmt: skip
     if out is not None:
         text = json.dumps(result, indent=1).replace("NaN", "null")
         out.write_text(text + "\n", encoding="utf-8")

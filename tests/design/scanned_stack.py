@@ -1,4 +1,4 @@
-"""Designed inputs measured: tracking, wrong parameters, quickest moves, time to design."""
+"""A stack that scans and moves quickly, on the independent reference with creep."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,20 +9,10 @@ from scipy.optimize import least_squares, linprog
 
 import psa_casadi as psa
 from psa_casadi import reference
-from psa_casadi.design.tracking.inversion import correct, invert
-from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove, quickest_move
-from psa_casadi.design.tracking.targets import (
-    AmplifierLimits,
-    Target,
-    TrackingError,
-    error_of,
-    uncompensated,
-)
-from psa_casadi.design.tracking.tracking import track
-from psa_casadi.report.words.phrases import number
+from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove
+from psa_casadi.design.tracking.targets import AmplifierLimits, Target
 from psa_casadi.simulation.start import linear_part
 from psa_casadi.units import FloatArray
-from tests.studies.benchmarks.table import Progress, TitledTable
 
 _RATIOS = (1.0, 10.0, 100.0)
 
@@ -116,7 +106,7 @@ ARCS = 6
 _SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
 
 
-def own_bang_bang(model: psa.Model, found: QuickMove) -> float | None:
+def bang_bang_move(model: psa.Model, found: QuickMove) -> float | None:
     """Return the length [s] of the stack's own bang-bang move that a design leads to.
 
     Between the limits, from the rest in which the design begins, of which x has crept; the search
@@ -177,7 +167,6 @@ STROKE = 10e-6
 #: Samples of one line of the scan; size of the parameters' errors; parameters that are conventions.
 LINE, WRONG = 250, 0.05
 _CONVENTIONS = ("hold_rate", "u_rated")
-_SEED = 7
 LIMITS = AmplifierLimits(min_voltage=-20.0, max_voltage=120.0)
 
 
@@ -214,38 +203,6 @@ def rounded_triangle(phase: FloatArray, turn: float) -> FloatArray:
     return np.asarray(np.where(s <= 0.5, way, full - way) / full)
 
 
-def judged(values: Mapping[str, float], target: Target, voltage: FloatArray) -> TrackingError:
-    """Return the error on the independent reference, with creep."""
-    return error_of(target, creeping_displacement(values, target.time, voltage))
-
-
-def tables(progress: Progress, quick: bool) -> tuple[TitledTable, ...]:
-    """Measure everything; `quick` on shorter scans and fewer draws."""
-    model = scanner()
-    target = scan(model, 500 if quick else 2000)
-    progress("scan")
-    designed = track(model, target)
-    return (
-        _errors(model, target, designed.voltage),
-        _wrong(model, target, designed.voltage, 2 if quick else 10, progress),
-        _moves(progress, quick),
-    )
-
-
-def _errors(model: psa.Model, target: Target, voltage: FloatArray) -> TitledTable:
-    plain, inverse = uncompensated(model, target).voltage, invert(model, target).response.voltage
-    rows = []
-    for name, v in {"uncompensated": plain, "inversion": inverse, "designed": voltage}.items():
-        error = judged(model.values, target, v)
-        rows.append({"voltage": name, "error, rms [% of range]": number(error.rms_percent),
-                     "largest [%]": number(error.largest_percent)})  # fmt: skip
-    note = (
-        f"{len(target.time)} samples at 1/20 of the first resonance (1.6 kHz), hysteresis 10 % of"
-        " the stroke, creep on; displacement of the independent reference. Target: 0.1 % rms."
-    )
-    return TitledTable("Raster scan on the independent reference", rows, note)
-
-
 def wrong_values(model: psa.Model, generator: np.random.Generator) -> dict[str, float]:
     """Return the values with every parameter off by 5 %, up or down at random."""
     changed = {
@@ -254,70 +211,3 @@ def wrong_values(model: psa.Model, generator: np.random.Generator) -> dict[str, 
         if name not in _CONVENTIONS
     }
     return {**model.values, **changed}
-
-
-def after_trials(
-    model: psa.Model, values: Mapping[str, float], target: Target, voltage: FloatArray
-) -> list[float]:
-    """Return the errors [% rms] as designed, with the range calibrated, and after two trials.
-
-    The plant is the reference with `values`; the model knows its own values only.
-    """
-    displayed = creeping_displacement(values, target.time, voltage)
-    gain = target.span / float(np.ptp(displayed))
-    items = [error_of(target, displayed), judged(values, target, gain * voltage)]
-    for _ in range(2):
-        voltage = correct(model, target, voltage, displayed)
-        displayed = creeping_displacement(values, target.time, voltage)
-        items.append(error_of(target, displayed))
-    return [e.rms_percent for e in items]
-
-
-def _wrong(
-    model: psa.Model, target: Target, voltage: FloatArray, draws: int, progress: Progress
-) -> TitledTable:
-    generator, short = np.random.default_rng(_SEED), len(target.time) // 4
-    part = Target(target.time[:short], target.displacement[:short])
-    items = []
-    for draw in range(draws):
-        progress(f"parameters off by 5 %: draw {draw + 1} of {draws}")
-        items.append(after_trials(model, wrong_values(model, generator), part, voltage[:short]))
-    names = ("as designed", "scaled by one measured range", "after one trial", "after two trials")
-    rows = [
-        {"voltage": n, "error, median [% rms]": number(float(np.median(e))),
-         "worst [% rms]": number(max(e))}
-        for n, e in zip(names, zip(*items, strict=True), strict=True)
-    ]  # fmt: skip
-    note = (
-        f"{draws} draws of random signs, all parameters off by 5 %, the gain by up to 10 %: no"
-        " voltage that is played blind is right then. A trial is one measured run of the scan."
-    )
-    return TitledTable("Every parameter off by 5 %", rows, note)
-
-
-def _moves(progress: Progress, quick: bool) -> TitledTable:
-    rows = []
-    for payload in (PAYLOAD,) if quick else (PAYLOAD, 0.0):
-        model = scanner(payload)
-        for begin, end in ((2e-6, 10e-6), (10e-6, 2e-6))[: 1 if quick else 2]:
-            progress(f"quickest move, {payload:g} kg")
-            quick_move = quickest_move(model, begin, end, LIMITS)
-            bound = bang_bang_bound(model.values, begin, end, -20.0, 120.0)
-            row = {"payload [kg]": f"{payload:g}", "move [um]": f"{1e6 * begin:g} to {1e6 * end:g}",
-                   "time [us]": number(1e6 * quick_move.move_time)}  # fmt: skip
-            value = own_bang_bang(model, quick_move)
-            for least, name, over in ((bound, "bang-bang bound [us]", "over it [%]"),
-                                      (value, "own bang-bang [us]", "over that [%]")):  # fmt: skip
-                row[name] = "none found" if least is None else number(1e6 * least)
-                row[over] = (
-                    "" if least is None else number(100 * (quick_move.move_time / least - 1))
-                )
-            rows.append(row | {"residual vibration [%]": number(100.0 * quick_move.residual, 2)})
-    note = (
-        "-20 V to 120 V. The bound is that of the linear part, which knows neither hysteresis nor"
-        " creep. The hysteresis takes part of the voltage of a move, and more of it downward, where"
-        " only 20 V lie beyond the rest. The stack's own bang-bang move, five switches between the"
-        " limits, is solved on the independent reference with hysteresis and creep. Targets: 10 %"
-        " over the bound, 0.1 % of residual vibration."
-    )
-    return TitledTable("Quickest moves", rows, note)
