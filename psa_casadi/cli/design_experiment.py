@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.errors import InputError
 
 #: Samples of a record where no number is given.
@@ -47,7 +47,7 @@ def experiment(
     still: bool = False,
     reading: Reading,
     fitting: Fitting,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
 
@@ -128,7 +128,7 @@ def experiment(
     limits = inputs.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
     level = inputs.attempt(lambda: _noise(chosen, noise or []))
     chosen, limits = inputs.ready(chosen), inputs.ready(limits)
-    with working("designing an experiment", inputs.quiet) as progress:
+    with working("designing an experiment") as progress:
         design = design_experiment(
             chosen, limits, records=records, separate=effects, parameters=parameter or [],
             optimality=optimality, noise=level, correlation=correlation,
@@ -140,14 +140,14 @@ def experiment(
         if report is not None:
             _write_page(report, design, chosen, still)
     for sentence in sentences(design):
-        show(sentence, inputs.quiet)
+        show(sentence)
     for displayed in design_tables(design):
-        show(f"\n{displayed.title}\n", inputs.quiet)
-        show_table(displayed.table, inputs.quiet)
-    tell_written(output, report, quiet=inputs.quiet)
+        show(f"\n{displayed.title}\n")
+        show_table(displayed.table)
+    show_written(output, report)
 
 
-def _stacks_effects(inputs: Given, wanted: Sequence[str]) -> "list[psa.Component]":
+def _stacks_effects(inputs: Inputs, wanted: Sequence[str]) -> "list[psa.Component]":
     """Return the effects of a stack to separate; all mistakes are noted."""
     from psa_casadi.model.own_effects import known_effects
 

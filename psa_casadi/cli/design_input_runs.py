@@ -9,7 +9,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.screen import show_results, tell_written, working
+from psa_casadi.cli.screen import show_results, show_written, working
 from psa_casadi.design.tracking import targets
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
@@ -36,12 +36,11 @@ class Task:
     report: Path | None
     still: bool
     check_fmu: bool
-    quiet: bool
 
 
 def track(task: Task, path: targets.Target, minimax: bool) -> None:
     """Design the voltage for a path."""
-    with working("designing", task.quiet) as progress:
+    with working("designing") as progress:
         result = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
         plain = targets.uncompensated(task.plant, path).displacement
         rows: _Rows = [("designed, full simulator", result.error)]
@@ -75,7 +74,7 @@ def track(task: Task, path: targets.Target, minimax: bool) -> None:
 
 def invert(task: Task, path: targets.Target) -> None:
     """Invert the model along a path; the limits cut the voltage."""
-    with working("inverting", task.quiet) as progress:
+    with working("inverting") as progress:
         result = inverted(task.plant, path, task.limits)
         rows: _Rows = [("inversion, full simulator", result.error)]
         for reached in _on_fmu(task, result.response, progress):
@@ -90,7 +89,7 @@ def invert(task: Task, path: targets.Target) -> None:
 
 def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     """Correct the voltage of a trial by what it showed."""
-    with working("correcting", task.quiet):
+    with working("correcting"):
         result = corrected(task.plant, path, trial, task.limits)
     change = float(np.max(np.abs(result.response.voltage - result.played)))
     summary = [
@@ -100,25 +99,15 @@ def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
         " is worth.",
         *targets.binding(result.response, task.limits),
     ]
-    rows, pictures = (
-        [("the trial, measured", result.error)],
-        designs.trial_pictures(result),
-    )
+    rows, pictures = ([("the trial, measured", result.error)], designs.trial_pictures(result))
     _finish(
-        task,
-        "Corrected input",
-        summary,
-        rows,
-        pictures,
-        result.response,
-        "one trial",
-        path=path,
+        task, "Corrected input", summary, rows, pictures, result.response, "one trial", path=path
     )
 
 
 def move(task: Task, ends: tuple[float, float]) -> None:
     """Design a quickest move between two positions [um]."""
-    with working("designing", task.quiet) as progress:
+    with working("designing") as progress:
         begin, end = (1e-6 * position for position in ends)
         quick = quickest_move(task.plant, begin, end, task.limits, progress=progress)
         summary = [
@@ -193,5 +182,5 @@ def _finish(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
                 badges=badges, live=live,
             )  # fmt: skip
-    show_results(summary, (titled.table for titled in tables), task.quiet)
-    tell_written(task.output, task.report, quiet=task.quiet)
+    show_results(summary, (titled.table for titled in tables))
+    show_written(task.output, task.report)

@@ -11,10 +11,10 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import judge
-from psa_casadi.cli.inputs import Given, meant
+from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
-from psa_casadi.cli.screen import show, show_table, tell_written, width, working
+from psa_casadi.cli.screen import show, show_table, show_written, width, working
 from psa_casadi.cli.steps import DIAGNOSE, events_to
 
 
@@ -43,7 +43,7 @@ def diagnose(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
@@ -115,7 +115,7 @@ def diagnose(
                 )  # fmt: skip
             wanted = files.expected(inputs, expect, max_error)
             inputs.check()
-        with working("diagnosing", inputs.quiet, DIAGNOSE) as progress, events_to(events) as watch:
+        with working("diagnosing", DIAGNOSE) as progress, events_to(events) as watch:
             try:
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
@@ -125,19 +125,17 @@ def diagnose(
         with stage("writing"):
             path = str(output) if output else None
             text = psa.story(d, origin=origin, width=width(), model_file=path)
-    show(text, inputs.quiet)
-    _tell_files(d, outputs, unpatched, inputs.quiet)
+    show(text)
+    _tell_files(d, outputs, unpatched)
     if timings:
-        show("", inputs.quiet)
-        show_table(timings_table(spent.stages), inputs.quiet)
-        show(
-            f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", inputs.quiet
-        )
+        show("")
+        show_table(timings_table(spent.stages))
+        show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s")
     subject = ", ".join(p.name for p in records)
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
 
 
-def _demand_model_name(inputs: Given, output: Path | None) -> None:
+def _demand_model_name(inputs: Inputs, output: Path | None) -> None:
     if output is not None and output.suffix.lower() in (".fmu", ".ssp", ".ssv"):
         inputs.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
 
@@ -147,7 +145,7 @@ def _of_stack(
     model: Path | None,
     device: tuple[StackName, float | None, Hysteresis],
     reading: Reading,
-    inputs: Given,
+    inputs: Inputs,
     left_out: Sequence[str],
 ) -> Callable[..., psa.Diagnosis]:
     """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
@@ -198,7 +196,7 @@ def _finish(
         raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
 
 
-def _keep_apart(inputs: Given, output: Path | None, model: Path | None) -> None:
+def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None:
     """Demand that no model written beside the output is the one that is read."""
     if output is None or model is None or model.resolve().parent != output.resolve().parent:
         return
@@ -206,7 +204,7 @@ def _keep_apart(inputs: Given, output: Path | None, model: Path | None) -> None:
         inputs.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
 
 
-def _searched(inputs: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
+def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
     """Return the effects to search, without those that --leave-out names."""
     from psa_casadi.model.own_effects import known_effects
 
@@ -219,17 +217,15 @@ def _searched(inputs: Given, left_out: Sequence[str]) -> "tuple[psa.Component, .
     return tuple(c for n, c in known.items() if n not in left_out)
 
 
-def _tell_files(
-    d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
-) -> None:
+def _tell_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
     items = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
     following = d.next_experiment.voltage_csv if isinstance(d, psa.StackDiagnosis) else None
-    tell_written(*items, following, quiet=quiet)
+    show_written(*items, following)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
-        show(line, quiet)
+        show(line)
 
 
 def _beside(path: Path | None) -> Path | None:

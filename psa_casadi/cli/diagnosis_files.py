@@ -7,7 +7,7 @@ from pathlib import Path
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.inputs import Given, meant
+from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
@@ -133,7 +133,7 @@ def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str]
 
 
 def expected(
-    inputs: Given, verdicts: str | None, max_error: str | None
+    inputs: Inputs, verdicts: str | None, max_error: str | None
 ) -> tuple[tuple[str, ...], float | None]:
     """Return the verdicts of which one must come out, and the largest held-out error [%]."""
     words = [re.sub(r"[\s-]+", "_", w.strip().lower()) for w in (verdicts or "").split(",")]

@@ -21,7 +21,7 @@ import typer
 
 from psa_casadi.cache import sweep_rooms
 from psa_casadi.cli import INTERRUPTED
-from psa_casadi.cli.screen import tell
+from psa_casadi.cli.screen import print_message
 from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.files import (
     abandon,
@@ -206,14 +206,14 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
             output = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
-            tell(f"Interrupted: {output}")
+            print_message(f"Interrupted: {output}")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             if os.environ.get(DEBUG):
                 raise
             told_of = InputError(NOWHERE) if _is_nowhere(error) else error
             for line in _told(told_of):
-                tell(line)
+                print_message(line)
             raise typer.Exit(2 if isinstance(told_of, InputError) else 1) from error
 
     return run
@@ -264,6 +264,6 @@ def judge(
         atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
     failures = [case.failure for case in cases if case.failure]
     for failure in failures if tells else ():
-        tell(f"Not as expected: {failure}")
+        print_message(f"Not as expected: {failure}")
     if failures:
         raise typer.Exit(1)

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Literal
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell, tell_written, width, working
+from psa_casadi.cli.screen import print_message, show, show_written, width, working
 from psa_casadi.cli.steps import IDENTIFY
 from psa_casadi.files import atomic_write
 
@@ -34,7 +34,7 @@ def identify(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine.
 
@@ -81,26 +81,25 @@ def identify(
                 of_stack, measured, model=start, stiffness=stiffness, hysteresis=hysteresis
             )
     inputs.check()
-    with working("identifying", inputs.quiet, IDENTIFY) as progress:
+    with working("identifying", IDENTIFY) as progress:
         result = work(progress=progress)
         profiles = _finish(result, outputs, profile or (), (origin, still), progress)
     text = repr(result)
     if isinstance(result, StackIdentification):
         text = identification_text(result, origin=origin, width=width())
-    show(text, inputs.quiet)
+    show(text)
     for found_profile in profiles:
-        show("\n" + "\n".join(profile_sentences(found_profile)), inputs.quiet)
+        show("\n" + "\n".join(profile_sentences(found_profile)))
     if left_out := [n for n in profile or () if n not in result.determinacy.names]:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
-            f" searched are {', '.join(result.determinacy.names)}.",
-            inputs.quiet,
+            f" searched are {', '.join(result.determinacy.names)}."
         )
-    tell_written(*outputs.values(), quiet=inputs.quiet)
+    show_written(*outputs.values())
 
 
 def _refuse_beside_paper(
-    inputs: Given, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
+    inputs: Inputs, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
 ) -> None:
     """Note the options that the paper's method does not take."""
     for wrong, sentence in (
@@ -121,7 +120,7 @@ def _save(model: psa.Model, output: Path) -> None:
         psa.save_model(model, output)
         return
     for statement in psa.save_start_values(model, output):
-        tell(f"Note: {statement}")
+        print_message(f"Note: {statement}")
 
 
 def _finish(

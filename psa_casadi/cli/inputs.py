@@ -1,4 +1,4 @@
-"""What a command is given, checked as a whole before any long work starts."""
+"""The inputs of a command, checked as a whole before any long work starts."""
 
 import difflib
 import os
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import psa_casadi as psa
 from psa_casadi.cli.options import Published, Reading, Start
-from psa_casadi.cli.screen import tell
+from psa_casadi.cli.screen import print_message, set_quiet
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
 
@@ -24,10 +24,10 @@ _PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".p
 
 
 @dataclass(kw_only=True)
-class Given:
-    """Collects the problems of everything that a command is given, to tell them all at once.
+class Inputs:
+    """The inputs of a command: collects their problems, to report all of them at once.
 
-    Unless `quiet`, what the reader took a record's columns for is told. `own` are the effects of
+    Unless `quiet`, it prints how the reader understood a record's columns. `own` are the effects of
     the modules that --effects names, `fitted` is the number of records that are not held out.
     """
 
@@ -38,6 +38,7 @@ class Given:
 
     def __post_init__(self) -> None:
         """Read the effects."""
+        set_quiet(self.quiet)
         self.own: list[psa.Component] = []
         self._misfits: list[str] = []
         if not self.effects:
@@ -103,7 +104,7 @@ class Given:
                 records.append(record)
                 self.fitted += fitted
                 for note in () if self.quiet else record.notes:
-                    tell(f"Note: {note}")
+                    print_message(f"Note: {note}")
         return records
 
     def signals(
@@ -122,7 +123,7 @@ class Given:
         if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")
         for note in [n for s in result or () for n in s.notes if not self.quiet]:
-            tell(f"Note: {note}")
+            print_message(f"Note: {note}")
         return result or ()
 
     def refuse(self, others: Mapping[str, object]) -> None:

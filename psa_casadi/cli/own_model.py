@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading
 from psa_casadi.errors import InputError, quoted
 
@@ -51,7 +51,7 @@ class Fitting:
 
 
 def own_model(
-    inputs: Given, path: Path | None, fitting: Fitting, *, fitted: bool = True
+    inputs: Inputs, path: Path | None, fitting: Fitting, *, fitted: bool = True
 ) -> psa.Model | None:
     """Return the model that a path names where it is no stack's; None for a stack's or none.
 
@@ -75,7 +75,7 @@ def own_model(
     return model
 
 
-def _model(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
     match = _PYTHON.fullmatch(str(path))
@@ -90,7 +90,7 @@ def _model(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Mod
     return None if is_stack(model) else model
 
 
-def _imported(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
     free: dict[str, tuple[float, float] | None] = {}
     for text in fitting.free or ():
@@ -134,7 +134,7 @@ def own_diagnosis(
     held_out: Sequence[Path],
     fitting: Fitting,
     reading: Reading,
-    inputs: Given,
+    inputs: Inputs,
     *,
     leave_out: Sequence[str],
     others: Mapping[str, object],

@@ -8,10 +8,10 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, width, working
+from psa_casadi.cli.screen import show, show_written, width, working
 from psa_casadi.files import atomic_path, atomic_write
 
 
@@ -32,7 +32,7 @@ def sample(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Draw the parameters of a model from their posterior, given records (extra sample).
 
@@ -76,7 +76,7 @@ def sample(
         measured = inputs.records(records, reading)
         start = inputs.model_or_stack(model, stack)
     start = inputs.ready(start)
-    with working("sampling", inputs.quiet) as progress:
+    with working("sampling") as progress:
         result = psa.sample(
             start, measured, prior=centres, widths=widths, chains=chains, draws=draws, tune=tune,
             seed=seed, progress=progress, **fitting.words,
@@ -91,11 +91,11 @@ def sample(
                 posterior_figure(result).savefig(temporary, format=picture_format(figure), dpi=DPI)
         if report is not None:
             psa.report(result, report)
-    show(posterior_text(result, origin=origin, width=width()), inputs.quiet)
-    tell_written(*files.values(), quiet=inputs.quiet)
+    show(posterior_text(result, origin=origin, width=width()))
+    show_written(*files.values())
 
 
-def _priors(inputs: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+def _priors(inputs: Inputs, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
     """Return centres and widths by the names of the parameters."""
     centres: dict[str, float] = {}
     widths: dict[str, float] = {}

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +13,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from psa_casadi.characters import visible
-from psa_casadi.cli.steps import PLAIN, Course, Told
+from psa_casadi.cli.steps import PLAIN, Course, ProgressLine
 
 if TYPE_CHECKING:
     from psa_casadi.report.words.tables import Table
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 Quiet = Annotated[
     bool, typer.Option("--quiet", "-q", help="No progress and no summary; errors still show.")
 ]
+#: Whether the command that runs prints no progress and no summary.
+_QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+set_quiet = _QUIET.set
 
 
 def width() -> int:
@@ -28,41 +32,46 @@ def width() -> int:
 
 
 @contextmanager
-def working(what: str, quiet: bool, course: Course = PLAIN) -> Iterator[Callable[[str], None]]:
-    """Yield a function that tells a step of long work: by a spinner, or lines off a terminal.
+def working(what: str, course: Course = PLAIN) -> Iterator[Callable[[str], None]]:
+    """Yield a function that shows a step of long work: by a spinner, or lines off a terminal.
 
-    Both tell the time so far, and the step of how many where the `course` of the work is known.
+    Both show the elapsed time, and the number of the step if the `course` of the work is known.
     """
-    output = Told(what, course)
-    if quiet:
+    progress = ProgressLine(what, course)
+    if _QUIET.get():
         yield lambda step: None
     elif sys.stderr.isatty():
-        with Console(stderr=True).status(output):
-            yield output.tell
+        with Console(stderr=True).status(progress):
+            yield progress.update
     else:
-        tell(output.first())
+        print_message(progress.first())
 
         def next_step(step: str) -> None:
-            output.tell(step)
-            tell(f"  {output.line(drawn=False)}")
+            progress.update(step)
+            print_message(f"  {progress.line(drawn=False)}")
 
         yield next_step
 
 
-def show(text: str, quiet: bool = False) -> None:
-    """Print a result, with what a terminal would obey spelled out."""
-    if not quiet:
-        typer.echo(visible(text))
+def show(text: str) -> None:
+    """Print a result unless the command is quiet, with control characters spelled out."""
+    if not _QUIET.get():
+        show_always(text)
 
 
-def tell(text: str) -> None:
-    """Print a message on stderr, with what a terminal would obey spelled out."""
+def show_always(text: str) -> None:
+    """Print what a command is asked for, also by --quiet."""
+    typer.echo(visible(text))
+
+
+def print_message(text: str) -> None:
+    """Print a message on stderr, with control characters spelled out."""
     typer.echo(visible(text), err=True)
 
 
-def show_table(table: "Table", quiet: bool = False) -> None:
+def show_table(table: "Table") -> None:
     """Print a table: drawn on a terminal, in plain columns elsewhere."""
-    if quiet:
+    if _QUIET.get():
         return
     table = replace(table, rows=tuple(tuple(map(visible, row)) for row in table.rows))
     if not sys.stdout.isatty():
@@ -80,17 +89,17 @@ def show_table(table: "Table", quiet: bool = False) -> None:
     console.print(drawn)
 
 
-def show_results(sentences: Iterable[str], tables: Iterable["Table"], quiet: bool) -> None:
+def show_results(sentences: Iterable[str], tables: Iterable["Table"]) -> None:
     """Print sentences, then tables, each behind an empty line."""
     for sentence in sentences:
-        show(sentence, quiet)
+        show(sentence)
     for table in tables:
-        show("", quiet)
-        show_table(table, quiet)
+        show("")
+        show_table(table)
 
 
-def tell_written(*paths: object, quiet: bool = False) -> None:
+def show_written(*paths: object) -> None:
     """Name the files that were written."""
     named = [str(p) for p in paths if p is not None]
     if named:
-        show(f"\nwritten: {', '.join(named)}", quiet)
+        show(f"\nwritten: {', '.join(named)}")

@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.cli.screen import show, show_written, working
 from psa_casadi.errors import Problems
 from psa_casadi.shown import with_units
 from psa_casadi.units import FloatArray, convert
@@ -30,7 +30,7 @@ def simulate(
     figure: Path | None = None,
     reading: Reading,
     begin: Start,
-    arguments: Given,
+    arguments: Inputs,
 ) -> None:
     """Simulate a model on measured or planned inputs; write every output with its unit.
 
@@ -69,7 +69,7 @@ def simulate(
     if chosen is not None:
         chosen = arguments.attempt(partial(_begun, chosen, values, starts))
     chosen, record = arguments.ready(chosen), arguments.ready(record)
-    with working("simulating", arguments.quiet):
+    with working("simulating"):
         inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):
             outputs, report = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
@@ -89,14 +89,14 @@ def simulate(
                 drawn = columns_figure(signals, [n for n in chosen.output_names if n in outputs])
                 drawn.savefig(temporary, format=picture_format(figure), dpi=DPI)
     begin_times, took = report
-    show(f"start: {begin_times}", arguments.quiet)
-    show(f"{record.n} samples over {record.duration:.6g} s{took}", arguments.quiet)
-    show(f"columns: {', '.join(written)}", arguments.quiet)
-    tell_written(output, figure, quiet=arguments.quiet)
+    show(f"start: {begin_times}")
+    show(f"{record.n} samples over {record.duration:.6g} s{took}")
+    show(f"columns: {', '.join(written)}")
+    show_written(output, figure)
 
 
 def _read(
-    inputs: Given,
+    inputs: Inputs,
     own_or_none: "Callable[[], psa.Model | None]",
     model: Path | None,
     stack: str | None,

@@ -1,4 +1,4 @@
-"""What long work tells: its step, the time so far, what is usual, and events in a file."""
+"""The progress of long work: its step, elapsed and usual time, and events in a file."""
 
 import json
 import math
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Course:
-    """The steps that a work takes in turn: a name, and how what it tells meanwhile begins or ends.
+    """The steps of a work in their order: a name, and how the messages of the step begin.
 
     Nine in ten take no longer than `usual_s` [s], once their models are compiled.
     """
@@ -28,7 +28,7 @@ class Course:
     usual_s: float
 
     def step_of(self, text: str) -> int:
-        """Return the number of the step that tells something, from 1; 0 where none does."""
+        """Return the number of the step that a message belongs to, from 1; 0 for none."""
         for k, (_, marks) in enumerate(self.steps, 1):
             if text.startswith(marks):
                 return k
@@ -79,26 +79,26 @@ DIAGNOSE = Course(
 PLAIN = Course((), 0.0)
 
 
-class Told:
-    """What a work has told so far, as a line that a terminal draws again and again."""
+class ProgressLine:
+    """The progress of a work in one line, which a terminal draws again and again."""
 
     def __init__(self, what: str, course: Course) -> None:
         self._what, self._course = what, course
-        self._begin, self._step, self._said = clock.monotonic(), 0, ""
+        self._begin, self._step, self._last = clock.monotonic(), 0, ""
 
-    def tell(self, text: str) -> None:
-        """Take what is told; the step never goes back, as parts of a work come again."""
-        self._said = text
+    def update(self, text: str) -> None:
+        """Take a message of the work; the step never goes back, as parts of a work repeat."""
+        self._last = text
         self._step = max(self._step, self._course.step_of(text))
 
     def first(self) -> str:
-        """Return that the work begins, and what is usual."""
+        """Return the first line: the work, and its usual duration."""
         return f"{self._what}{self._usual(0.0)} ..."
 
     def line(self, *, drawn: bool = True) -> str:
-        """Return how far the work is; what is usual only where a line is `drawn` again and again.
+        """Return the progress; with the usual duration if the line is `drawn` again and again.
 
-        Else the first line has told it, until the work takes longer.
+        Lines that stay have it only once the work takes longer, as the first line states it.
         """
         elapsed = clock.monotonic() - self._begin
         parts = [self._what]
@@ -108,7 +108,7 @@ class Told:
         parts.append(_duration(elapsed))
         late = elapsed > self._course.usual_s
         line = ", ".join(parts) + (self._usual(elapsed) if drawn or late else "")
-        return f"{line}: {self._said}" if self._said else line
+        return f"{line}: {self._last}" if self._last else line
 
     def _usual(self, elapsed: float) -> str:
         if not self._course.usual_s:
@@ -132,7 +132,8 @@ def _duration(seconds: float) -> str:
 def events_to(path: Path | None) -> Iterator[Callable[["Tried"], None]]:
     """Yield a function that adds a line for a hypothesis to a file at once; to none without one.
 
-    A line holds the fields of `Tried`; a number that is not finite is null. The file is begun anew.
+    A line holds the fields of `Tried`; a number that is not finite is null. It
+    replaces an older file.
 
     Raises:
         InputError: the file cannot be written to.
@@ -146,12 +147,12 @@ def events_to(path: Path | None) -> Iterator[Callable[["Tried"], None]]:
         raise InputError(f"{path}: cannot write ({error.strerror}); choose another name.") from None
     with stream:
 
-        def tell(tried: "Tried") -> None:
+        def write_event(tried: "Tried") -> None:
             row = {name: _plain(value) for name, value in asdict(tried).items()}
             stream.write(json.dumps(row, allow_nan=False) + "\n")
             stream.flush()
 
-        yield tell
+        yield write_event
 
 
 def _plain(value: Any) -> Any:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell, tell_written, working
+from psa_casadi.cli.screen import print_message, show_always, show_written, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import temporary_folder
 
@@ -33,7 +33,7 @@ def web(
     port: Annotated[int | None, typer.Option(min=1, max=65535)] = None,
     no_browser: bool = False,
     fitting: Fitting,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a page to play with a stack: any voltage, every effect, no network.
 
@@ -77,9 +77,9 @@ def web(
     inputs.outputs({"--output": path}, [model], page="--output")
     chosen = inputs.model_or_stack(model, stack, needed=False)
     inputs.check()
-    with working("compiling", inputs.quiet):
+    with working("compiling"):
         write_playground(path, chosen)
-    tell_written(path, quiet=inputs.quiet)
+    show_written(path)
 
 
 def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
@@ -102,7 +102,7 @@ def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> 
     return Subject(model.input_names, model.output_names, units, tuple(arguments), fmus)
 
 
-def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> None:
+def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Inputs) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.workbench.desk import Desk
@@ -116,8 +116,8 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> No
         folder.mkdir()
         desk = Desk(folder, list(known_effects(inputs.own)), modules, subject)
         with suppress(KeyboardInterrupt), served(port, desk) as server:
-            show(f"Open {server.address}")
-            tell("Ctrl-C ends the page and removes its files.")
+            show_always(f"Open {server.address}")
+            print_message("Ctrl-C ends the page and removes its files.")
             sys.stdout.flush()
             if not no_browser:  # by a file that leads there: other users see what it is told
                 way, address = place / "open.html", escape(server.address)
@@ -129,4 +129,4 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> No
                 webbrowser.open(way.as_uri())
             while True:
                 time.sleep(3600.0)
-        tell("Ended; the files of the page are removed.")
+        print_message("Ended; the files of the page are removed.")

@@ -21,7 +21,7 @@ from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.cli import steps
 from psa_casadi.cli.app import app
 from psa_casadi.cli.screen import show_table, working
-from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, Told
+from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, ProgressLine
 from psa_casadi.datasets import DATASETS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
@@ -187,14 +187,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
-    output = Told("diagnosing", DIAGNOSE)
+    output = ProgressLine("diagnosing", DIAGNOSE)
     assert output.line() == "diagnosing, 0 s (most take up to 40 s)"
     clock.now = 7.4
-    output.tell("screening effects")
+    output.update("screening effects")
     step = "diagnosing, step 3 of 6 (screening the effects)"
     assert output.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
     clock.now = 130.0
-    output.tell("base fit from zero")  # parts of the work come again; the step does not go back
+    output.update("base fit from zero")  # parts of the work come again; the step does not go back
     assert output.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
     assert output.line(drawn=False) == output.line()
     console = Console(width=200)
@@ -206,7 +206,7 @@ def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
 def test_lines_that_stay_tell_once_what_is_usual(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with working("diagnosing", False, DIAGNOSE) as progress:
+    with working("diagnosing", DIAGNOSE) as progress:
         clock.now = 3.0
         progress("screening effects")
         clock.now = 41.0

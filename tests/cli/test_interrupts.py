@@ -195,7 +195,7 @@ def test_a_designed_voltage_is_kept_without_its_check(
 def test_files_that_stand_are_named_however_late_the_interrupt(
     record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "tell_written", cut)
+    monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "show_written", cut)
     psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
     items = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]

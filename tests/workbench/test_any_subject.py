@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.web import _subject
 from psa_casadi.workbench.desk import Desk
@@ -23,7 +23,7 @@ FREE = ["area=0.1:4", "outlet=0.001:0.01"]
 
 
 def _desk(folder: Path, fitting: Fitting, module: str) -> Desk:
-    model = own_model(Given(), None, fitting)
+    model = own_model(Inputs(), None, fitting)
     (folder / "desk").mkdir()
     return Desk(folder / "desk", [], subject=_subject(model, None, fitting), module=module)
 

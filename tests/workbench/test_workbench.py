@@ -16,7 +16,7 @@ from urllib.parse import quote
 import pytest
 
 from psa_casadi.cli import web
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.workbench.run import Run
@@ -333,6 +333,6 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
         for modules in ([], ["gratings"]):
             monkeypatch.setattr(sys, "path", [first, *sys.path])
             with pytest.raises(InputError, match="no server"):
-                web._serve(0, True, Subject(), Given(effects=modules))
+                web._serve(0, True, Subject(), Inputs(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])

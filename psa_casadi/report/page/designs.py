@@ -21,13 +21,7 @@ from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
-from psa_casadi.report.words.phrases import (
-    in_brackets,
-    length_scale,
-    number,
-    plain,
-    prefixed_scale,
-)
+from psa_casadi.report.words.phrases import in_brackets, length_scale, number, plain, prefixed_scale
 from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
@@ -155,9 +149,7 @@ def _curve(
 
 
 def write_experiment_page(
-    path: str | os.PathLike[str],
-    design: Separated | Informative,
-    live: LiveModel | None = None,
+    path: str | os.PathLike[str], design: Separated | Informative, live: LiveModel | None = None
 ) -> None:
     """Write the page of a designed experiment, with what each of its rivals predicts.
 

@@ -126,10 +126,7 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             verdicts=words.verdict_table(findings, scale),
             warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
             budget=any(f.budget for f in findings)
-            and {
-                "panel": plots.budget_plot(findings),
-                "table": words.budget_table(findings),
-            },
+            and {"panel": plots.budget_plot(findings), "table": words.budget_table(findings)},
             parameters=rows
             and {
                 "panel": plots.difference_plot(findings, rows),

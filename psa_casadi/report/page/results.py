@@ -278,9 +278,7 @@ def fit_page(
             determined=_determined(identification, graded),
             profiles=[
                 Picture(
-                    f"Profile of {p.name}",
-                    findings.profile_plot(p),
-                    " ".join(profile_sentences(p)),
+                    f"Profile of {p.name}", findings.profile_plot(p), " ".join(profile_sentences(p))
                 )
                 for p in profiles
             ],

@@ -420,13 +420,7 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
 
 #: A code's sentence: a template with the values' names, or what makes it of the values.
 Sentence = str | Callable[..., str]
-SENTENCES: Mapping[str, Sentence] = {
-    **DIAGNOSIS,
-    **IDENTIFICATION,
-    **MISFIT,
-    **NOISE,
-    **OWN_MODELS,
-}
+SENTENCES: Mapping[str, Sentence] = {**DIAGNOSIS, **IDENTIFICATION, **MISFIT, **NOISE, **OWN_MODELS}
 
 
 class _Words(Formatter):

@@ -47,11 +47,7 @@ Lines = Sequence[tuple[str, str]]
 
 
 def story(
-    d: Diagnosis,
-    *,
-    origin: str = "measured",
-    width: int = 100,
-    model_file: str | None = None,
+    d: Diagnosis, *, origin: str = "measured", width: int = 100, model_file: str | None = None
 ) -> str:
     """Return a diagnosis in ten to twenty lines: verdict with gain, errors, cause, what now, rest.
 
