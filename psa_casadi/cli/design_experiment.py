@@ -97,34 +97,23 @@ def experiment(
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
     effects: Sequence[Any] = [*dict.fromkeys([*(separate or []), *(more or [])])]
-    records: Sequence[psa.Signals]
     if chosen is not None:
-        stacks_own = ("low", "high", "current")
-        inputs.refuse({"--stack": stack, **{f"--{n}": wanted[n] for n in stacks_own}})
-        records = inputs.signals(chosen, record or [], reading)
+        inputs.refuse({"--stack": stack, "--low": low, "--high": high, "--current": current})
+        records: Sequence[psa.Signals] = inputs.signals(chosen, record or [], reading)
         table = {c.name: c for c in inputs.of_any_model()}
         effects = [table.get(n, n) for n in effects]
     else:
         records = inputs.records(record, reading) if record else []
         effects = _stacks_effects(inputs, effects)
         chosen = inputs.model_or_stack(model, stack)
-    for wrong, sentence in (
-        (
-            len(effects) == 1,
-            "One effect alone cannot be separated from anything; name two effects or more.",
-        ),
-        (
-            effects and parameter,
-            "--separate and --parameter are both given; design one record for each.",
-        ),
-        (
-            not 0.0 <= correlation < 1.0,
-            f"--correlation is {correlation:g}; give a number from 0 to below 1.",
-        ),
-        (starts < 1, f"--starts is {starts}; give 1 or more."),
-    ):
-        if wrong:
-            inputs.add(sentence)
+    if len(effects) == 1:
+        inputs.add("One effect alone cannot be separated from anything; name two effects or more.")
+    if effects and parameter:
+        inputs.add("--separate and --parameter are both given; design one record for each.")
+    if not 0.0 <= correlation < 1.0:
+        inputs.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
+    if starts < 1:
+        inputs.add(f"--starts is {starts}; give 1 or more.")
     limits = inputs.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
     level = inputs.attempt(lambda: _noise(chosen, noise or []))
     chosen, limits = inputs.ready(chosen), inputs.ready(limits)
@@ -139,8 +128,7 @@ def experiment(
             psa.write_record(output, columns_to_play(design))
         if report is not None:
             _write_page(report, design, chosen, still)
-    for sentence in sentences(design):
-        show(sentence)
+    show("\n".join(sentences(design)))
     for displayed in design_tables(design):
         show(f"\n{displayed.title}\n")
         show_table(displayed.table)

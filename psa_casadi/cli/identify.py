@@ -102,16 +102,12 @@ def _refuse_beside_paper(
     inputs: Inputs, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
 ) -> None:
     """Note the options that the paper's method does not take."""
-    for wrong, sentence in (
-        (profile, "has no likelihood; leave --profile or --method out."),
-        (starts != (None, None), "starts from no model; leave --model, --stack or --method out."),
-        (
-            hysteresis not in (None, "bouc-wen"),
-            "finds Bouc-Wen parameters; leave --hysteresis or --method out.",
-        ),
-    ):
-        if wrong:
-            inputs.add(f"--method paper {sentence}")
+    if profile:
+        inputs.add("--method paper has no likelihood; leave --profile or --method out.")
+    if starts != (None, None):
+        inputs.add("--method paper starts from no model; leave --model, --stack or --method out.")
+    if hysteresis not in (None, "bouc-wen"):
+        inputs.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
 
 
 def _save(model: psa.Model, output: Path) -> None:

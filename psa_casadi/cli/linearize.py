@@ -49,7 +49,7 @@ def linearize(
     Example:
         psa linearize --stack P-885.51 --at voltage=60 -o stack.mat --figure bode.png
     """
-    from psa_casadi.report.plots.figures import save_bode
+    from psa_casadi.report.plots.figures import bode_figure, write_figure
 
     arguments.outputs(
         {"--output": output, "--figure": figure, "--observer": observer}, [model, fmu]
@@ -73,7 +73,7 @@ def linearize(
     if output is not None:
         result.save(output)
     if figure is not None:
-        save_bode(result, figure)
+        write_figure(bode_figure(result), figure)
     if observer is not None:
         made = psa.observer(
             result,

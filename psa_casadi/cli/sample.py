@@ -12,7 +12,7 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, width, working
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.files import atomic_write
 
 
 def sample(
@@ -58,7 +58,7 @@ def sample(
         psa sample record.csv --model model.json -o posterior.nc --figure posterior.png
     """
     from psa_casadi.report.documents.files import posterior_file
-    from psa_casadi.report.plots.figures import DPI, picture_format, posterior_figure
+    from psa_casadi.report.plots.figures import posterior_figure, write_figure
     from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 
@@ -87,8 +87,7 @@ def sample(
         if json is not None:
             atomic_write(json, json_text(posterior_file(result)))
         if figure is not None:
-            with atomic_path(figure) as temporary:
-                posterior_figure(result).savefig(temporary, format=picture_format(figure), dpi=DPI)
+            write_figure(posterior_figure(result), figure)
         if report is not None:
             psa.report(result, report)
     show(posterior_text(result, origin=origin, width=width()))

@@ -55,8 +55,7 @@ def simulate(
     Example:
         psa simulate --stack P-885.51 --input voltage.csv --history 120,0 -o out.csv
     """
-    from psa_casadi.files import atomic_path
-    from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
+    from psa_casadi.report.plots.figures import columns_figure, write_figure
 
     arguments.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
@@ -85,9 +84,8 @@ def simulate(
         )
         psa.write_record(output, written)
         if figure is not None:
-            with atomic_path(figure) as temporary:
-                drawn = columns_figure(signals, [n for n in chosen.output_names if n in outputs])
-                drawn.savefig(temporary, format=picture_format(figure), dpi=DPI)
+            first = [n for n in chosen.output_names if n in outputs]
+            write_figure(columns_figure(signals, first), figure)
     begin_times, took = report
     show(f"start: {begin_times}")
     show(f"{record.n} samples over {record.duration:.6g} s{took}")

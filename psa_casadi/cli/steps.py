@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import time as clock
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,60 +20,35 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Course:
-    """The steps of a work in their order: a name, and how the messages of the step begin.
+    """The steps of a work in their order: a name, and a pattern of how its messages begin.
 
     Nine in ten take no longer than `usual_s` [s], once their models are compiled.
     """
 
-    steps: tuple[tuple[str, tuple[str, ...]], ...]
+    steps: tuple[tuple[str, str], ...]
     usual_s: float
 
     def step_of(self, text: str) -> int:
         """Return the number of the step that a message belongs to, from 1; 0 for none."""
-        for k, (_, marks) in enumerate(self.steps, 1):
-            if text.startswith(marks):
-                return k
-        return 0
+        return next((k for k, (_, p) in enumerate(self.steps, 1) if re.match(p, text)), 0)
 
 
-_BASE = ("starting values", ("starting values", "what the reference"))
+_BASE = ("starting values", "starting values|what the reference")
 _FIT = (
     "the base model",
-    (
-        "base fit",
-        "exchanged",
-        "resonances and lags",
-        "moments",
-        "the model",
-        "fitting from",
-        "fitting parts",
-        "fitting longer",
-        "fit from",
-    ),
+    "base fit|exchanged|resonances and lags|moments|the model|fitting (from|parts|longer)|fit from",
 )
 IDENTIFY = Course(
-    (_BASE, _FIT, ("what to measure next", ("what further",)), ("files", ("profile", "writing"))),
-    20.0,
+    (_BASE, _FIT, ("what to measure next", "what further"), ("files", "profile|writing")), 20.0
 )
 DIAGNOSE = Course(
     (
         _BASE,
         _FIT,
-        ("screening the effects", ("the displacement with", "screening", "searching again")),
-        (
-            "trying causes",
-            (
-                "cause ",
-                "several causes",
-                "without ",
-                "all causes",
-                "fitting the r",
-                "fitting the w",
-                "the same",
-            ),
-        ),
-        ("judging", ("judging", "a free function", "a formula")),
-        ("files", ("comparing", "improving", "writing", "fitting the unnamed")),
+        ("screening the effects", "the displacement with|screening|searching again"),
+        ("trying causes", "cause |several causes|without |all causes|fitting the [rw]|the same"),
+        ("judging", "judging|a free function|a formula"),
+        ("files", "comparing|improving|writing|fitting the unnamed"),
     ),
     40.0,
 )

@@ -31,7 +31,6 @@ _WORDS: dict[type, Callable[..., str]] = {
     StackIdentification: identification_text,
     Posterior: posterior_text,
 }
-Told = AnyDiagnosisFile
 Reported = Diagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
@@ -65,7 +64,7 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
     return figure_of(result) if whole else one_output(result, ax, output)
 
 
-def line(result: Plotted | Told) -> str:
+def line(result: Plotted | AnyDiagnosisFile) -> str:
     """Return a result in one line."""
     if isinstance(result, Diagnosis | AnyDiagnosisFile):
         return _diagnosis(result)
@@ -86,7 +85,7 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _diagnosis(d: Diagnosis | Told) -> str:
+def _diagnosis(d: Diagnosis | AnyDiagnosisFile) -> str:
     named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     causes = f": {named}" if named else ""
     if not isinstance(d, StackDiagnosis | DiagnosisFile):
@@ -97,7 +96,7 @@ def _diagnosis(d: Diagnosis | Told) -> str:
     return f"<Diagnosis {d.verdict}{causes}; held-out error {errors}>"
 
 
-def cell(result: Plotted | Model | Told) -> str:
+def cell(result: Plotted | Model | AnyDiagnosisFile) -> str:
     """Return a result as a notebook shows it: its words, and its picture or table."""
     if isinstance(result, Model):
         return filled("cell.html", lines=[repr(result)], table=parameter_table(result))
@@ -108,8 +107,6 @@ def cell(result: Plotted | Model | Told) -> str:
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     if isinstance(result, Signals):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
-    words = line(result) if isinstance(result, Trajectory) else repr(result)
-    for kind, notify in _WORDS.items():
-        if isinstance(result, kind):
-            words = notify(result)
-    return filled("cell.html", told=words, name=line(result), picture=picture)
+    words = next((of(result) for kind, of in _WORDS.items() if isinstance(result, kind)), None)
+    words = words or (line if isinstance(result, Trajectory) else repr)(result)
+    return filled("cell.html", words=words, name=line(result), picture=picture)

@@ -1,4 +1,4 @@
-"""The files of the page and its runs; what lies there is the same for every tab."""
+"""The files of the page and its runs, the same for every tab."""
 
 import re
 import shutil
@@ -17,8 +17,6 @@ from psa_casadi.workbench.previews import preview
 from psa_casadi.workbench.run import Run, Settings, removed
 from psa_casadi.workbench.subject import Subject
 
-#: The most files, and the most bytes of all of them together.
-MOST_FILES, MOST_TOGETHER = 32, 2 * MOST_BYTES
 #: The longest name, in letters.
 _LONGEST = 80
 _BLOCK = 2**20
@@ -31,8 +29,8 @@ class Limits:
     """The most that is taken: bytes of one file, of all together, and files."""
 
     one: int = MOST_BYTES
-    together: int = MOST_TOGETHER
-    files: int = MOST_FILES
+    together: int = 2 * MOST_BYTES
+    files: int = 32
 
 
 def stored_name(name: str, taken: Collection[str]) -> str:
@@ -85,7 +83,7 @@ class BusyError(Exception):
 class Item:
     """A file on the workbench: the name that it had, and where it lies by a name without marks.
 
-    It may be kept for judging only; `seen` says how it reads, once that is known.
+    It may be held out; `preview` holds its columns and its picture, once they are known.
     """
 
     key: int
@@ -93,7 +91,7 @@ class Item:
     path: Path
     size: int
     held: bool = False
-    seen: dict[str, Any] | None = field(default=None, compare=False)
+    preview: dict[str, Any] | None = field(default=None, compare=False)
 
     @property
     def is_model(self) -> bool:
@@ -101,9 +99,9 @@ class Item:
         return self.path.suffix.lower() == ".json"
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows of it."""
+        """Return its state for the page."""
         table = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
-        return {**table, "held": self.held, "model": self.is_model, "seen": self.seen}
+        return {**table, "held": self.held, "model": self.is_model, "seen": self.preview}
 
 
 class Desk:
@@ -260,21 +258,21 @@ class Desk:
         both = (self._run, self._export)
         return [r for r in both if r is not None and r.status == "running"]
 
-    # What is told
+    # State
 
-    def state(self, version: int, number: int, observed: int) -> dict[str, Any]:
+    def state(self, version: int, number: int, event_count: int) -> dict[str, Any]:
         """Return what has changed for a tab that knows a version and so many events of a run."""
         with self._lock:
             table: dict[str, Any] = {"version": self._version}
             if self._run is not None:
                 self._run.look()
-                new = self._run.events[observed if number == self._number else 0 :]
+                new = self._run.events[event_count if number == self._number else 0 :]
                 table["run"] = {**self._run.state(), "number": self._number, "events": new}
             table["export"] = None if self._export is None else self._export.state()
             if version != self._version:
                 table["items"] = [i.state() for i in self._items.values()]
                 table["settings"] = vars(self._settings)
-                table["result"] = runs.found(self.folder)
+                table["result"] = runs.diagnosis_summary(self.folder)
                 table["files"] = runs.files_left(self.folder)
             return table
 
@@ -295,7 +293,7 @@ class Desk:
             )  # fmt: skip
             with self._lock:
                 if self._items.get(key) == item and settings == self._settings:
-                    self._items[key] = replace(item, seen=table)
+                    self._items[key] = replace(item, preview=table)
                     self._changed()
 
     def _idle(self) -> None:

@@ -1,4 +1,4 @@
-"""What a file looks like: first rows, columns, a small picture. Read in a process of its own.
+"""A preview of a file: first rows, columns, a small picture; read in a separate process.
 
 A damaged file may end the process that reads it, and a large one fills its memory; neither is to
 end the page.
@@ -87,12 +87,12 @@ def looked_at(
             signals, *_ = read_signals(
                 file, inputs=inputs, outputs=outputs, columns=wanted, sample_time=sample_time
             )
-            output = _told_of_signals(signals, inputs)
+            output = _signals_summary(signals, inputs)
         else:
             record, *_ = read_records(
                 [file], columns=wanted, sample_time=sample_time, need_excitation=not held
             )
-            output = _told(record)
+            output = _record_summary(record)
     except InputError as error:
         problems = list(error.problems)
     table = _problem(*problems)
@@ -108,7 +108,7 @@ def _problem(*sentences: str) -> dict[str, Any]:
     return {"head": None, "problems": list(sentences), "record": None}
 
 
-def _told(record: Record) -> dict[str, Any]:
+def _record_summary(record: Record) -> dict[str, Any]:
     """Return how long a record is, what it reaches, and its picture."""
     others = ("load_force", "current", "temperature", "monitor_voltage", "charge",
               "displacement_2", "strain")  # fmt: skip
@@ -120,8 +120,8 @@ def _told(record: Record) -> dict[str, Any]:
     }
 
 
-def _told_of_signals(signals: Signals, inputs: Sequence[str]) -> dict[str, Any]:
-    """Return what `_told` returns, of a record on any model."""
+def _signals_summary(signals: Signals, inputs: Sequence[str]) -> dict[str, Any]:
+    """Return what `_record_summary` returns, of a record on any model."""
     measured = {n: signals.units.get(n, "") for n in signals.columns if n not in inputs}
     return {
         **_extent(signals, measured),
@@ -184,11 +184,11 @@ def _png(figure: Figure) -> str:
 
 
 def main() -> None:
-    """Read what is asked for on the command line and write the answer to standard output."""
+    """Read the file that the command line names, and write its preview to standard output."""
     end_with_parent()
     content = json.loads(sys.argv[1])
     out = sys.stdout
-    with contextlib.redirect_stdout(sys.stderr):  # libraries may say something
+    with contextlib.redirect_stdout(sys.stderr):  # libraries may print
         table = looked_at(**content)
     json.dump(table, out, allow_nan=False)
 

@@ -1,4 +1,4 @@
-"""One diagnosis or export: the command it is, what the search tells meanwhile, what it leaves."""
+"""One diagnosis or export: its command, the events of its search, its files."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ from psa_casadi.children import Child, close_pipes, interrupt, kill, started_pyt
 from psa_casadi.errors import InputError, MachineError
 
 Status = Literal["running", "done", "failed", "stopped"]
-#: Lines that are kept of what a command says, and the longest part of one.
+#: Lines of output that are kept of a command, and the longest part of one.
 _LINES, _LONGEST_LINE = 400, 2000
 #: Time [s] that an interrupted command has to write what it keeps.
 _PATIENCE = 20.0
@@ -91,9 +91,9 @@ class Settings:
 class Run:
     """A command that runs, or has run, in the folder of its results; it ends with this process.
 
-    `said` and `told` are what it has written to its two streams by now, line by line; `seconds` is
-    how long it has run, `events` what the search has told. `ended` is called once, from the thread
-    that waits for it.
+    `printed` and `messages` are the lines of its standard output and standard error so far;
+    `seconds` is its run time, `events` are those of the search. `ended` is called once, from the
+    thread that waits for it.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class Run:
         self.command = shlex.join(["psa", *arguments])
         self.status: Status = "running"
         self.events: list[dict[str, Any]] = []
-        self.said: deque[str] = deque(maxlen=_LINES)
-        self.told: deque[str] = deque(maxlen=_LINES)
+        self.printed: deque[str] = deque(maxlen=_LINES)
+        self.messages: deque[str] = deque(maxlen=_LINES)
         # this thread lives as long as the child: on Linux a child ends with its parent's thread
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -139,7 +139,7 @@ class Run:
         self._thread.join()
 
     def look(self) -> None:
-        """Read what the search has told since the last look."""
+        """Read the events of the search since the last look."""
         path = self._folder / EVENTS
         if not path.exists():
             return
@@ -157,9 +157,9 @@ class Run:
             "command": self.command,
             "status": self.status,
             "seconds": (self._end or time.monotonic()) - self._begin,
-            "line": self.told[-1] if self.told else "",
-            "said": list(self.said),
-            "told": list(self.told)[-40:],
+            "line": self.messages[-1] if self.messages else "",
+            "printed": list(self.printed),
+            "messages": list(self.messages)[-40:],
         }
 
     def _run(self) -> None:
@@ -169,16 +169,16 @@ class Run:
                 self._child = child
                 if self._stopped:
                     interrupt(child)
-                code = self._heard(child)
+                code = self._collect_output(child)
         except MachineError as error:
-            self.told.append(str(error))
+            self.messages.append(str(error))
         finally:
             self._end = time.monotonic()
             self.status = "stopped" if self._stopped and code else "failed" if code else "done"
             self._ended()
 
-    def _heard(self, child: Child) -> int:
-        """Keep what a child says until it ends; return its exit code."""
+    def _collect_output(self, child: Child) -> int:
+        """Keep the output of a child until it ends; return its exit code."""
 
         def keep(stream: IO[bytes], lines: deque[str]) -> None:
             while row := stream.readline(_LONGEST_LINE):
@@ -186,7 +186,7 @@ class Run:
 
         readers = [
             threading.Thread(target=keep, args=pair, daemon=True)
-            for pair in ((child.stdout, self.said), (child.stderr, self.told))
+            for pair in ((child.stdout, self.printed), (child.stderr, self.messages))
         ]
         if child.stdin is not None:
             child.stdin.close()
@@ -210,7 +210,7 @@ def diagnosis(
     return ["diagnose", *fitted, *kept, *start, *settings.options(), *outputs]
 
 
-def found(folder: Path) -> dict[str, Any] | None:
+def diagnosis_summary(folder: Path) -> dict[str, Any] | None:
     """Return the main figures of the diagnosis that lies in a folder, None where none does."""
     try:
         content = json.loads((folder / JSON).read_text(encoding="utf-8"))

@@ -47,7 +47,7 @@ _DOOR = (
     '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records</title>'
     f"</head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script></body></html>\n"
 )
-#: What a browser is told to refuse: scripts and styles but the page's own, requests to others, a
+#: What a browser must refuse: scripts and styles but the page's own, requests to others, a
 #: frame around the page.
 _PAGE_POLICY = {
     "Content-Security-Policy": (
@@ -82,7 +82,7 @@ def page(effects: Sequence[str], subject: Subject) -> str:
     template = environment().from_string(_PAGE.joinpath("workbench.html").read_text("utf-8"))
     markup = Markup(json.dumps(table).replace("<", "\\u003c"))
     return template.render(
-        style=_STYLE, script=_SCRIPT, version=__version__, told=markup, stack=not outputs
+        style=_STYLE, script=_SCRIPT, version=__version__, setup=markup, stack=not outputs
     )
 
 

@@ -44,7 +44,7 @@ def test_the_columns_are_those_of_the_fmu(tmp_path: Path) -> None:
         tab = Tab(server).enter()
         page = tab.ask("GET", "/")[2].decode()
         assert "level" in page
-        assert "charge" not in page.partition('id="told">')[2]
+        assert "charge" not in page.partition('id="page-data">')[2]
         assert tab.give("model.json", b"{}") == 400
         assert tab.give("run.csv", _measured(tmp_path)) == 200
         observed = tab.state()["items"][0]["seen"]

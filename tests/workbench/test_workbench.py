@@ -184,7 +184,7 @@ def test_a_stopped_run_keeps_what_it_has_and_can_begin_again(tab: Tab) -> None:
     assert tab.post("/stop") == 200
     state = tab.until("stopped")
     assert set(state["files"]) == {"extended.json"}
-    assert state["run"]["told"][-1] == "Interrupted: kept."
+    assert state["run"]["messages"][-1] == "Interrupted: kept."
     assert tab.post("/start") == 200
     assert tab.until("running")["run"]["number"] == 2
 

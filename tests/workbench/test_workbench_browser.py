@@ -21,7 +21,7 @@ HOSTILE = "<img src=x onerror=document.title=1>.csv"
 #: Leaves of the page what was tried, the verdict, and the top of the report.
 _FROM_THE_SEARCH = """
   var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
-    + ' #h-run, #said, #downloads, #result .bar';
+    + ' #h-run, #printed, #downloads, #result .bar';
   document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
   document.querySelector('#report').style.height = '740px';
   scrollTo(0, 0);

@@ -135,8 +135,8 @@ def hash_of(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-class Told(Lined):
-    """A diagnosis as its file tells it: shows itself, and is written again as it was read."""
+class ResultFile(Lined):
+    """A result as its file has it: shows itself, and is written again as it was read."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what this version does not know is left out."""
@@ -282,7 +282,7 @@ class FreeCorrection:
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class AnyDiagnosisFile(Told):
+class AnyDiagnosisFile(ResultFile):
     """A diagnosis: verdict, causes, what the base misses and what remains.
 
     It answers by the names of a result what needs no samples and no model. `values` are the

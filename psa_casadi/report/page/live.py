@@ -3,7 +3,7 @@
 import base64
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,7 @@ from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import determined
-from psa_casadi.report.words.phrases import (
-    added,
-    handy_scale,
-    in_brackets,
-    length_scale,
-    plain,
-    shown_in,
-)
+from psa_casadi.report.words.phrases import added, handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
@@ -100,7 +93,7 @@ class LiveModel:
     extended: bool = False
     correction: str = ""
 
-    def told(self) -> dict[str, Any] | None:
+    def page_data(self) -> dict[str, Any] | None:
         """Return what live.js must know, once the module is there; None where there is none."""
         module = self.module.result()
         if module is None:
@@ -113,32 +106,21 @@ class LiveModel:
         limit, rows = _SAMPLES // len(displayed), []
         for r in displayed:
             s = r.series  # of a stack all records have the same units
-            scales = {"length": length, "error": error}
-            if s.unit:
-                scales = {"length": s.scale, "error": s.residual_scale}
-            words = {
-                "captions": [
-                    f"{s.title} over time",
-                    f"{s.title} over {r.along}" if r.along else "",
-                    f"{self.aim} minus model".capitalize(),
-                ],
-                "labels": [
-                    in_brackets(s.quantity, scales["length"].unit),
-                    s.against,
-                    in_brackets("difference", scales["error"].unit),
-                ],
-            }
-            table = {n: {"unit": q.unit, "factor": q.factor} for n, q in scales.items()}
-            rows.append({**_record(r, limit, self.design), **table, **words})
+            units = (s.scale, s.residual_scale) if s.unit else (length, error)
+            over = f"{s.title} over {r.along}" if r.along else ""
+            labels = map(in_brackets, (s.quantity, "difference"), (q.unit for q in units))
+            rows.append({
+                **_record(r, limit, self.design),
+                **{n: asdict(q) for n, q in zip(("length", "error"), units, strict=True)},
+                "captions": [f"{s.title} over time", over, f"{self.aim} minus model".capitalize()],
+                "labels": [next(labels), s.against, next(labels)],
+            })  # fmt: skip
         return {
             "kind": "report",
             **live_data(self.model, module),
             "records": rows,
-            "time": {"unit": first.time_scale.unit, "factor": first.time_scale.factor},
-            "extended": self.extended,
-            "design": self.design,
-            "aim": self.aim,
-            "correction": self.correction,
+            "time": asdict(first.time_scale),
+            **{n: getattr(self, n) for n in ("extended", "design", "aim", "correction")},
             "legend": [["--measured", self.aim], ["--model", "model"], ["--fitted", "as it was"]],
         }
 
@@ -337,24 +319,23 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
 
 
 def _variable(v: State | Output) -> dict[str, Any]:
-    scale = _scale(v.unit, v.display_unit or v.unit)
-    return {"name": v.name, "description": v.description, "si": v.unit, **scale}
+    return {"name": v.name, "description": v.description, "si": v.unit, **_scale(v)}
 
 
-def _scale(unit: str, display: str) -> dict[str, Any]:
-    shift = convert(0.0, unit, display)
-    return {"unit": display, "factor": convert(1.0, unit, display) - shift, "shift": shift}
+def _scale(v: State | Output | Parameter) -> dict[str, Any]:
+    unit = v.display_unit or v.unit
+    shift = convert(0.0, v.unit, unit)
+    return {"unit": unit, "factor": convert(1.0, v.unit, unit) - shift, "shift": shift}
 
 
 def _parameter(model: Model, p: Parameter, known: bool) -> dict[str, Any]:
-    unit, display = shown_in(model, p.name)
     interval = model.provenance.intervals.get(p.name)
     sure = [interval.low, interval.high] if interval is not None else []
     ends = _ends(model, p)
     return {
         "name": p.name,
         "description": p.description,
-        **_scale(unit, display),
+        **_scale(p),
         "value": model.values[p.name],
         "bounds": np.clip(p.bounds, -_NO_BOUND, _NO_BOUND).tolist(),
         "ends": list(ends),

@@ -71,7 +71,7 @@ def playground(model: Model | None = None) -> str:
         "band": _BAND,
     }
     badges = ["every effect", "no network"]
-    return render("playground.html", f"Play with {title}", badges, told=table)
+    return render("playground.html", f"Play with {title}", badges, data=table)
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
-from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import StackIdentification
@@ -50,17 +49,8 @@ _OF_STACK = (
     "stack", "answers", "views", "splits", "signatures", "columns", "gained", "blind", "noise",
     "moved", "most", "excess", "patch",
 )  # fmt: skip
-#: Views that say much the same: one of each family is drawn.
-_FAMILIES = {
-    "displacement": "voltage",
-    "since_reversal": "reversal",
-    "since_reversal_lag": "reversal",
-    "from_reversal": "reversal",
-    "amplitude_gain": "amplitude",
-    "amplitude_lag": "amplitude",
-    "frequency_gain": "frequency",
-    "frequency_lag": "frequency",
-}
+#: Views that show nearly the same as another one: of these, and of gain and lag, one is drawn.
+_FAMILIES = {"displacement": "voltage", "from_reversal": "since_reversal"}
 _STATUSES = {
     "fit": "good",
     "read off": "good",
@@ -88,7 +78,10 @@ def write_report(
 
     Raises InputError when `path` cannot be written to.
     """
-    atomic_write(path, _diagnosis_page(diagnosis, origin, still, model_file))
+    stack = diagnosis if isinstance(diagnosis, StackDiagnosis) else None
+    scale = phrases.scale_of(stack.experiments, stack.base_errors.holdout_rms_m) if stack else None
+    with phrases.one_unit(scale):
+        atomic_write(path, _page(diagnosis, stack, origin, still, model_file))
 
 
 def write_fit_report(
@@ -109,17 +102,8 @@ def write_fit_report(
     """
     series = series_of_fit(identification)
     live = None if still else live_fit(identification, series)
-    atomic_write(
-        path, fit_page(identification, series, origin=origin, profiles=profiles, live=live)
-    )
-
-
-def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
-    stack = d if isinstance(d, StackDiagnosis) else None
-    if stack is None:
-        return _page(d, None, origin, still, model_file)
-    with phrases.one_unit(phrases.scale_of(d.experiments, stack.base_errors.holdout_rms_m)):
-        return _page(d, stack, origin, still, model_file)
+    page = fit_page(identification, series, origin=origin, profiles=profiles, live=live)
+    atomic_write(path, page)
 
 
 def _page(
@@ -129,13 +113,13 @@ def _page(
     live = None if still else live_diagnosis(d, series)  # compiles meanwhile
     gain = tables.error_table(d, series[0].residual_scale)
     by_record = len(d.experiments) > 1 and not stack
+    parts = _budget(d) | (_of_stack(stack) if stack else _of_any(d, series))
     about = f" of {plain(d.model.name)}" if not stack else ""
-    none = dict.fromkeys(_OF_STACK, ())
     return render(
         "diagnosis.html",
         f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
         **_shared(d.model, series, d.experiments, origin),
-        **{**none, **_budget(d), **(_of_stack(stack) if stack else _of_any(d, series))},
+        **{**dict.fromkeys(_OF_STACK, ()), **parts},
         d=d,
         added=added(d),
         verdict=verdict_words.verdict_sentence(d),
@@ -149,7 +133,11 @@ def _page(
                 "effect": effects[c.effect],
                 "size": verdict_words.cause_size(d, c),
                 "parameters": tables.parameter_table(d.model, only=c.parameters),
-                "alternatives": _alternatives(stack, c) if stack else [],
+                "alternatives": [
+                    f"{phrases.raised(verdict_words.alternative_sentence(d, a))}."
+                    for a in (stack.alternatives if stack else ())
+                    if a.cause == c.effect
+                ],
             }
             for c in d.causes
         ],
@@ -157,12 +145,6 @@ def _page(
         rest=phrases.rest_sentence(d),
         candidates=tables.candidate_table(d),
     )
-
-
-def _alternatives(d: StackDiagnosis, cause: Cause) -> list[str]:
-    """Say which models have another effect in a cause's place."""
-    items = [a for a in d.alternatives if a.cause == cause.effect]
-    return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in items]
 
 
 def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
@@ -246,7 +228,7 @@ def fit_page(
     """
     scale = max((s.residual_scale for s in series), key=lambda s: 1.0 / s.factor)
     stack = identification if isinstance(identification, StackIdentification) else None
-    with phrases.one_unit(scale) if stack else nullcontext():
+    with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
         graded, tiles = fit_words.grades(identification), []
         error = text.fit_sentence(identification) if stack is None else ""
@@ -269,7 +251,7 @@ def fit_page(
             **_shared(
                 identification.model, series, identification.experiments, origin, identification
             ),
-            found=identification,
+            identification=identification,
             combinations=stack.combinations if stack else (),
             further=stack.advice if stack else (),
             verdict=f"{error} {fit_words.determined_sentence(graded)}",
@@ -300,7 +282,7 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
         "posterior.html",
         f"Posterior of {name}",
         [records],
-        found=posterior,
+        posterior=posterior,
         verdict=f"The posterior of {name}, given {records}: {text.drawn(posterior)}.",
         figure=posterior_figure(posterior),
         parameters=text.posterior_table(posterior),
@@ -441,7 +423,8 @@ def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
         rows += [("holds", m.holds.share)] if m.holds and m.holds.significant else []
         rows.append(("spectrum", m.spectrum.share))
         for name, share in rows:
-            family = _FAMILIES.get(name, name)
+            family = name.removesuffix("_gain").removesuffix("_lag")
+            family = _FAMILIES.get(family, family)
             if share > WORTH_SAYING and (family not in best or share > best[family][0]):
                 best[family] = (share, m, name)
     order = sorted(best.values(), key=lambda row: -row[0])

@@ -4,6 +4,7 @@ import os
 import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from psa_casadi.report.words.series import (
 )
 from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
-from psa_casadi.units import FloatArray, convert
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 
 Compared = Diagnosis | Identification
@@ -86,14 +87,17 @@ def save_figure(
     cannot be written to.
     """
     make = narrow_figure if narrow else diagnosis_figure
-    with atomic_path(path) as temporary:
-        make(diagnosis, origin=origin).savefig(temporary, format=picture_format(path))
+    write_figure(make(diagnosis, origin=origin), path)
 
 
-def picture_format(path: str | os.PathLike[str]) -> str:
-    """Return what the ending of a picture's name says: svg, pdf, else png."""
+def write_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a picture, whole or not at all: SVG or PDF where `path` ends so, else PNG.
+
+    Raises InputError when `path` cannot be written to.
+    """
     ending = Path(path).suffix.lower().removeprefix(".")
-    return ending if ending in ("svg", "pdf") else "png"
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=ending if ending in ("svg", "pdf") else "png")
 
 
 def figure_of(result: Plotted) -> Figure:
@@ -205,12 +209,6 @@ def bode_figure(of: Linear) -> Figure:
     rows[0, 0].set_ylabel("gain")
     rows[1, 0].set_ylabel("phase [degrees]")
     return figure
-
-
-def save_bode(of: Linear, path: str | os.PathLike[str]) -> None:
-    """Write the Bode picture of a linearised model, PNG, SVG or PDF as the name ends."""
-    with atomic_path(path) as temporary:
-        bode_figure(of).savefig(temporary, format=picture_format(path), dpi=DPI)
 
 
 def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
@@ -450,23 +448,22 @@ def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) 
 
 def _draw_parameter(axes: Axes, posterior: Posterior, f: Figures) -> None:
     """Draw the posterior of a parameter, and its prior."""
-    unit, display = phrases.shown_in(posterior.model, f.name)
+    in_unit = partial(phrases.in_display_unit, posterior.model, f.name)
     values, before = (
-        np.array([convert(v, unit, display) for v in posterior.tree[g][f.name].to_numpy().ravel()])
-        for g in ("posterior", "prior")
+        np.array(in_unit(*posterior.tree[group][f.name].to_numpy().ravel())[1])
+        for group in ("posterior", "prior")
     )
+    unit, (mean, *interval) = in_unit(f.mean, f.low, f.high)
     axes.hist(values, bins=_BINS, density=True, color=colours.EXTENDED, alpha=0.7)
     low, high = axes.get_xlim()
     inside = before[(before >= low) & (before <= high)]
     if len(inside) >= 0.2 * max(len(before), 1):
         weights = np.full(len(inside), _BINS / (2.0 * (high - low) * len(before)))
         axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=colours.BASE)
-    for end in (f.low, f.high):
-        axes.axvline(
-            convert(end, unit, display), color=colours.NOISE, linestyle="--", linewidth=1.0
-        )
-    title = f"{f.name} = {phrases.number(convert(f.mean, unit, display), 4)}"
-    style(axes, title, phrases.in_brackets(f.name, display), "")
+    for end in interval:
+        axes.axvline(end, color=colours.NOISE, linestyle="--", linewidth=1.0)
+    title = f"{f.name} = {phrases.number(mean, 4)}"
+    style(axes, title, phrases.in_brackets(f.name, unit), "")
     axes.set_yticks([])
 
 
@@ -500,8 +497,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     draw(right, signature_plot(signature), textwrap.fill(title, 48), legend=legend)
     look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
     figure.suptitle(f"{look}\n{size_sentence(signature)}", fontsize=FONT + 1)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format=picture_format(path), dpi=DPI)
+    write_figure(figure, path)
 
 
 def size_sentence(signature: Signature) -> str:

@@ -8,17 +8,16 @@ from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, S
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
 from psa_casadi.report.words.phrases import (
+    in_display_unit,
     interval_text,
     listing,
     number,
     percent,
     plain,
     probability_text,
-    shown_in,
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.start import is_stack
-from psa_casadi.units import convert
 
 _FAMILIES = {
     "free": "free-form, linear between corners",
@@ -132,17 +131,13 @@ def _intervals(design: Informative) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
     rows, model = [], design.rivals[0].model
     for name, after in design.intervals.items():
-        unit, display = shown_in(model, name)
-        cells = (
-            interval_text(*(convert(v, unit, display) for v in ends))
-            for ends in (design.before[name], after)
-        )
-        value = number(convert(model.values[name], unit, display), 4)
+        values = (model.values[name], *design.before[name], *after)
+        unit, (value, *ends) = in_display_unit(model, name, *values)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
-        output = half < 10 and after != model.parameter(name).bounds
-        rows.append(
-            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if output else "open")
-        )
+        bounded = half < 10 and after != model.parameter(name).bounds
+        width = f"{number(100.0 * half, 2)} %" if bounded else "open"
+        intervals = interval_text(*ends[:2]), interval_text(*ends[2:])
+        rows.append((name, number(value, 4), unit, *intervals, width))
     head = ("parameter", "value", "unit", "known before", "95 % interval after", "half width")
     return Table(head, tuple(rows))
 

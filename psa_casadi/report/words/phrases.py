@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
+from psa_casadi.units import convert
 
 #: A length in a sentence stays in its own unit where the page's would give a larger number.
 _LARGEST = 1000.0
@@ -41,8 +42,8 @@ _PAGE: ContextVar[Scale | None] = ContextVar("unit of a page", default=None)
 
 
 @contextmanager
-def one_unit(scale: Scale) -> Iterator[None]:
-    """Show all errors in one unit meanwhile, so that those of one page can be compared."""
+def one_unit(scale: Scale | None) -> Iterator[None]:
+    """Show all errors in one unit meanwhile, each in a handy one without a scale."""
     before = _PAGE.set(scale)
     try:
         yield
@@ -247,10 +248,11 @@ def with_its_unit(value: float, unit: str) -> str:
     return with_unit(number(scale.factor * value), scale.unit or "1")
 
 
-def shown_in(model: Model, name: str) -> tuple[str, str]:
-    """Return the SI unit of a parameter and the unit it is shown in."""
+def in_display_unit(model: Model, name: str, *values: float) -> tuple[str, list[float]]:
+    """Return the display unit of a parameter, and SI values in it."""
     parameter = model.parameter(name)
-    return parameter.unit, parameter.display_unit or parameter.unit
+    unit = parameter.display_unit or parameter.unit
+    return unit, [convert(v, parameter.unit, unit) for v in values]
 
 
 def interval_text(low: float, high: float) -> str:

@@ -39,7 +39,7 @@ METHOD = (
 )
 
 
-class _Shown:
+class _ParameterText:
     """A parameter's estimates as text, in the unit that the parameter is shown in."""
 
     def __init__(self, e: population.Estimates) -> None:
@@ -131,7 +131,7 @@ def population_tables(p: population.Population) -> dict[str, Table]:
     outliers, rows, batches, drifts = [], [], [], []
     for o in p.outliers:
         s, place = spreads[o.parameter], devices[o.device]
-        result, displayed = p.findings[place], _Shown(s.estimates)
+        result, displayed = p.findings[place], _ParameterText(s.estimates)
         mean, half = float(s.common.b[0]), NORMAL_95 * s.common.tau
         theta = float(s.estimates.theta[s.estimates.places.index(place)])
         outliers.append(
@@ -140,7 +140,7 @@ def population_tables(p: population.Population) -> dict[str, Table]:
              _p(o.p_adjusted))
         )  # fmt: skip
     for name, s in spreads.items():
-        c, displayed = s.common, _Shown(s.estimates)
+        c, displayed = s.common, _ParameterText(s.estimates)
         rows.append(
             (
                 name,
@@ -286,7 +286,7 @@ def difference_table(findings: Sequence[Finding], rows: Sequence[population.Diff
     """Return the shared parameters with intervals, one device a column, and whether they differ."""
     body = []
     for d in rows:
-        displayed, cells = _Shown(d.estimates), []
+        displayed, cells = _ParameterText(d.estimates), []
         for k, f in enumerate(findings):
             p = f.parameters.get(displayed.name)
             if p is None or k not in d.estimates.places:

@@ -17,6 +17,7 @@ from psa_casadi.report.words.phrases import (
     Scale,
     added,
     handy_scale,
+    in_display_unit,
     interval_text,
     listing,
     lowered,
@@ -26,12 +27,10 @@ from psa_casadi.report.words.phrases import (
     prefixed_scale,
     raised,
     scale_of,
-    shown_in,
     with_its_unit,
     with_unit,
 )
 from psa_casadi.report.words.verdict_words import within
-from psa_casadi.units import convert
 
 _FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"
 
@@ -188,7 +187,7 @@ class Advice:
     """What to do: a sentence for every cause, what else counts, and commands to type."""
 
     causes: tuple[str, ...]
-    beside: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
 
 
@@ -318,8 +317,8 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
 def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:
     """Return how large an effect of a model is, with the size of its gain."""
     name = effect.gain or ""
-    unit, display = shown_in(model, name)
-    gain = with_unit(number(convert(model.values[name], unit, display), 2), display)
+    unit, (value,) = in_display_unit(model, name, model.values[name])
+    gain = with_unit(number(value, 2), unit)
     size = size_text(sizes, handy_scale) or "it changes too little to be seen in its test"
     stack = next((n for n in STACKS if re.sub(r"\W", "_", n) == model.name), "this model")
     return f"on {stack} with {name} = {gain}: {size}"

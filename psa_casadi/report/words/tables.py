@@ -20,6 +20,7 @@ from psa_casadi.report.words.phrases import (
     Scale,
     added,
     in_brackets,
+    in_display_unit,
     interval_text,
     number,
     percent,
@@ -27,12 +28,10 @@ from psa_casadi.report.words.phrases import (
     prefixed_scale,
     probability_text,
     share_text,
-    shown_in,
     with_unit,
 )
 from psa_casadi.report.words.series import ResidualFigures, Series
 from psa_casadi.simulation.timings import Stage
-from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
@@ -116,16 +115,11 @@ def parameter_table(
     """
     rows = []
     for p in (p for p in model.structure.parameters if only is None or p.name in only):
-        unit, display = shown_in(model, p.name)
         interval = model.provenance.intervals.get(p.name)
-        text = ""
-        if interval is not None:
-            low, high = (convert(v, unit, display) for v in (interval.low, interval.high))
-            text = interval_text(low, high)
-        value = number(convert(model.values[p.name], unit, display), 4)
-        rows.append(
-            (p.name, value, text, display, _status(model, p.name, identification), p.description)
-        )
+        known = (interval.low, interval.high) if interval else ()
+        unit, (value, *ends) = in_display_unit(model, p.name, model.values[p.name], *known)
+        text, status = interval_text(*ends) if ends else "", _status(model, p.name, identification)
+        rows.append((p.name, number(value, 4), text, unit, status, p.description))
     return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
 
 
@@ -304,10 +298,10 @@ def stack_table(stack: Stack) -> Table:
     model = stack_model(stack.name)
     rows = []
     for name in model.parameter_names:
-        unit, display = shown_in(model, name)
         figure = stack.values[name]
-        value = number(convert(figure.value, unit, display), 6)
-        rows.append((name, value, display, "assumed" if figure.assumed else "", figure.source))
+        unit, (value,) = in_display_unit(model, name, figure.value)
+        assumed = "assumed" if figure.assumed else ""
+        rows.append((name, number(value, 6), unit, assumed, figure.source))
     return _table(("parameter", "value", "unit", "", "source"), rows)
 
 

@@ -23,6 +23,7 @@ from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
     added,
+    in_display_unit,
     labelled,
     listing,
     number,
@@ -33,12 +34,10 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     scale_of,
-    shown_in,
     with_its_unit,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
-from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
@@ -65,7 +64,7 @@ def story(
     return labelled([lines[0], *now, *lines[1:]], width)
 
 
-def told(d: Diagnosis) -> str:
+def diagnosis_text(d: Diagnosis) -> str:
     """Return how a diagnosis of any model prints: its verdict, and its story without advice."""
     return f"{d.verdict}\n{labelled(_lines(d, 'measured'), 100)}"
 
@@ -239,13 +238,12 @@ def posterior_table(posterior: Posterior) -> Table:
     """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
     rows = []
     for f in posterior.figures:
-        unit, display = shown_in(posterior.model, f.name)
-        mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
-        spread = convert(f.mean + f.sd, unit, display) - mean
+        values = (f.mean, f.low, f.high, f.mean + f.sd)
+        unit, (mean, low, high, upper) = in_display_unit(posterior.model, f.name, *values)
         interval = f"{number(low, 4)} to {number(high, 4)}"
-        output = (display, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
+        sampling = (unit, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
         meaning = posterior.model.parameter(f.name).description
-        rows.append((f.name, number(mean, 4), number(spread), interval, *output, meaning))
+        rows.append((f.name, number(mean, 4), number(upper - mean), interval, *sampling, meaning))
     head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
     return Table(head, tuple(rows))
 

@@ -11,7 +11,6 @@ from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis,
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
-from psa_casadi.units import convert
 
 VERDICTS = {
     "adequate": "adequate",
@@ -198,7 +197,7 @@ def family_sentence(families: Sequence[Family]) -> str:
     return phrases.listing(parts, "or")
 
 
-def alternative_sentence(d: StackDiagnosis, a: Alternative) -> str:
+def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
     apart = phrases.scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
     inside = any(c.name == a.cause for c in d.model.plant().components)
@@ -235,10 +234,9 @@ def cause_size(d: Diagnosis, cause: Cause) -> str:
     for name, e in cause.parameters.items():
         if name in weights:
             continue
-        unit, display = phrases.shown_in(d.model, name)
-        value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
-        estimate = phrases.with_unit(phrases.number(value), display)
-        texts.append(f"{name} = {estimate} ({phrases.interval_text(low, high)})")
+        unit, (value, *ends) = phrases.in_display_unit(d.model, name, e.value, *e.interval)
+        estimate = phrases.with_unit(phrases.number(value), unit)
+        texts.append(f"{name} = {estimate} ({phrases.interval_text(*ends)})")
     if weights:
         texts.append(f"{len(weights)} weights, which shape its loop together")
     return ", ".join(texts)
