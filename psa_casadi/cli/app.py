@@ -61,11 +61,11 @@ def _main(
 def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
     """Add commands; the first sentence stands whole in the list, the example on one line."""
     for function in functions:
-        output, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
+        about, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
         kinds = [p.annotation for p in inspect.signature(function).parameters.values()]
         group.command(
             function.__name__.strip("_"),
-            short_help=output.partition("\n\n")[0],
+            short_help=about.partition("\n\n")[0],
             epilog=f"\b\nExample: {' '.join(example.split())}" if example else None,
             context_settings={"allow_extra_args": typer.Context in kinds},
         )(command(function))

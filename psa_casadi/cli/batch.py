@@ -57,20 +57,20 @@ def batch(
     from psa_casadi.report.words.population_words import missed_sentences
 
     inputs.stiffness(stiffness)
-    item = own_model(inputs, model, fitting)
-    if item is None:
+    any_model = own_model(inputs, model, fitting)
+    if any_model is None:
         inputs.columns(reading.columns)
         inputs.model(model)
     inputs.outputs({"--report": report}, [model])
     jobs = inputs.attempt(lambda: jobs_given(records))
     inputs.check()
-    text = model.read_text(encoding="utf-8-sig") if model and item is None else None
+    text = model.read_text(encoding="utf-8-sig") if model and any_model is None else None
     options = psa.Options(
-        work=work, model=item or text, stiffness=stiffness, hysteresis=hysteresis,
+        work=work, model=any_model or text, stiffness=stiffness, hysteresis=hysteresis,
         columns=reading.columns, sample_time=reading.sample_time,
         modules=tuple(inputs.effects or ()), words=fitting.words,
     )  # fmt: skip
-    result = None
+    whole = None
     with ExitStack() as held, working("batch") as progress:
         client = held.enter_context(dask_client(dask, workers)) if dask else None
         done = psa.batch(
@@ -78,18 +78,18 @@ def batch(
             progress=progress,
         )  # fmt: skip
         with suppress(psa.InputError):  # too few devices tell a parameter
-            result = population(done.findings) if report is not None else None
+            whole = population(done.findings) if report is not None else None
     rows = [(d, (d.device, d.status, " ".join(d.problems))) for d in done.devices]
-    if report is not None and result is not None:
-        psa.write_population(result, report, without=[row for d, row in rows if d.problems])
+    if report is not None and whole is not None:
+        psa.write_population(whole, report, without=[row for d, row in rows if d.problems])
     counts = ", ".join(f"{n} {status}" for status, n in done.counts.items())
     kept = f"; {done.kept} of them were there before" if done.kept else ""
     show(f"{len(done.devices)} devices: {counts}{kept}.")
     show_lost([row for d, row in rows if d.status != "done"], done.files[0])
     for sentence in missed_sentences(done.findings):
         show(sentence)
-    show_written(*done.files, report if result else None)
-    if report is not None and result is None:
+    show_written(*done.files, report if whole else None)
+    if report is not None and whole is None:
         show(f"{report} was not written: fewer than four devices tell a parameter.")
     if not done.findings:
         raise typer.Exit(1)
@@ -126,11 +126,11 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), inputs: I
     inputs.check()
     with working("comparing"):
         if len(files) == 1 and files[0].is_dir():
-            result, lost = read_results(files[0], inputs.own)
+            findings, lost = read_results(files[0], inputs.own)
             show_lost(lost, output)
-            displayed = population(result)
-            psa.write_population(displayed, output, without=lost)
-            texts = population_sentences(displayed)
+            whole = population(findings)
+            psa.write_population(whole, output, without=lost)
+            texts = population_sentences(whole)
         else:
             compared = psa.compare(*files, effects=inputs.own)
             compared.report(output)

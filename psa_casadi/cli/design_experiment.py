@@ -129,9 +129,9 @@ def experiment(
         if report is not None:
             _write_page(report, design, chosen, still)
     show("\n".join(sentences(design)))
-    for displayed in design_tables(design):
-        show(f"\n{displayed.title}\n")
-        show_table(displayed.table)
+    for titled in design_tables(design):
+        show(f"\n{titled.title}\n")
+        show_table(titled.table)
     show_written(output, report)
 
 
@@ -157,18 +157,18 @@ def _limits(
 
     if model is None:
         return {}
-    statement = {k: v for k, v in wanted.items() if v is not None}
+    given_limits = {k: v for k, v in wanted.items() if v is not None}
     if is_stack(model) and records:
         return {"voltage": limits_of(records, **wanted)}
-    if "duration" not in statement:
+    if "duration" not in given_limits:
         raise InputError("No length is given; add --duration SECONDS, or --record with records.")
-    samples = int(statement.pop("samples", _SAMPLES))
+    samples = int(given_limits.pop("samples", _SAMPLES))
     if is_stack(model):
-        statement = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **statement}
-        if not statement["high"]:
+        given_limits = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **given_limits}
+        if not given_limits["high"]:
             raise InputError("The model has no rated voltage; add --high VOLTS.")
-        return {"voltage": Limits(samples=samples, **statement)}
-    table = {}
+        return {"voltage": Limits(samples=samples, **given_limits)}
+    limits = {}
     for text in inputs:
         name, _, figures = text.partition("=")
         try:
@@ -177,13 +177,13 @@ def _limits(
             raise InputError(
                 f"--input is '{text}'; give NAME=LOW:HIGH, such as {model.input_names[0]}=0:10."
             ) from None
-        item = {**statement, "rate": steepest[0]} if steepest else statement
-        table[name] = Limits(low=low, high=high, samples=samples, **item)
-    if not table:
+        settings = {**given_limits, "rate": steepest[0]} if steepest else given_limits
+        limits[name] = Limits(low=low, high=high, samples=samples, **settings)
+    if not limits:
         raise InputError(
             f"No input may move; add --input NAME=LOW:HIGH, of {', '.join(model.input_names)}."
         )
-    return table
+    return limits
 
 
 def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] | float | None:

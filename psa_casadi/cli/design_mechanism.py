@@ -87,17 +87,17 @@ def mechanism(
 
 def _poles(text: str | None) -> tuple[complex, ...]:
     """Read poles in rad/s, such as -4e4+4e4j,-4e4-4e4j."""
-    items = []
+    poles = []
     for part in (text or "").split(","):
         if not part.strip():
             continue
         try:
-            items.append(complex(part.replace(" ", "").replace("i", "j")))
+            poles.append(complex(part.replace(" ", "").replace("i", "j")))
         except ValueError as error:
             raise InputError(
                 f"--poles: '{part.strip()}' is no pole; write -4e4+4e4j,-4e4-4e4j in rad/s."
             ) from error
-    return tuple(items)
+    return tuple(poles)
 
 
 def _share(text: str) -> float:

@@ -85,7 +85,7 @@ def diagnose(
     }  # fmt: skip
     began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
     healthy = reference or []
-    item = own_model(inputs, model, fitting)
+    any_model = own_model(inputs, model, fitting)
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
@@ -93,9 +93,9 @@ def diagnose(
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
             _demand_model_name(inputs, output)
-            table = {"--next": next_, "--events": events, "--junit": junit}
-            inputs.outputs({**outputs, **table}, [*records, *held, *healthy, model, fitting.fmu])
-            if item is None:
+            others = {"--next": next_, "--events": events, "--junit": junit}
+            inputs.outputs({**outputs, **others}, [*records, *held, *healthy, model, fitting.fmu])
+            if any_model is None:
                 run = _of_stack(
                     (records, held, healthy),
                     model,
@@ -107,7 +107,7 @@ def diagnose(
                 _keep_apart(inputs, output, model)
             else:
                 run = own_diagnosis(
-                    item, records, held, fitting, reading, inputs, leave_out=left_out,
+                    any_model, records, held, fitting, reading, inputs, leave_out=left_out,
                     others={
                         "--reference": healthy, "--next": next_, "--stack": stack,
                         "--stiffness": stiffness, "--hysteresis": hysteresis,
@@ -126,13 +126,13 @@ def diagnose(
             path = str(output) if output else None
             text = psa.story(d, origin=origin, width=width(), model_file=path)
     show(text)
-    _tell_files(d, outputs, unpatched)
+    _show_files(d, outputs, unpatched)
     if timings:
         show("")
         show_table(timings_table(spent.stages))
         show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s")
     subject = ", ".join(p.name for p in records)
-    judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
+    judge("diagnose", subject, files.cases(d, *wanted), junit, began, show_failures=True)
 
 
 def _demand_model_name(inputs: Inputs, output: Path | None) -> None:
@@ -156,15 +156,15 @@ def _of_stack(
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
     stack, stiffness, hysteresis = device
-    table = _searched(inputs, left_out)
+    effects = _searched(inputs, left_out)
     inputs.stiffness(stiffness)
     new, held, healthy = paths
-    result = inputs.records([*new, *healthy], reading, held)
+    read = inputs.records([*new, *healthy], reading, held)
     first, last = len(new), inputs.fitted
     start = inputs.model_or_stack(model, stack, needed=False)
     return partial(
-        run, result[:first], reference=result[first:last], holdout=result[last:], model=start,
-        stiffness=stiffness, hysteresis=hysteresis, effects=table,
+        run, read[:first], reference=read[first:last], holdout=read[last:], model=start,
+        stiffness=stiffness, hysteresis=hysteresis, effects=effects,
     )  # fmt: skip
 
 
@@ -217,13 +217,13 @@ def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, 
     return tuple(c for n, c in known.items() if n not in left_out)
 
 
-def _tell_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str) -> None:
+def _show_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
-    items = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    written = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
     following = d.next_experiment.voltage_csv if isinstance(d, psa.StackDiagnosis) else None
-    show_written(*items, following)
+    show_written(*written, following)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
         show(line)
 

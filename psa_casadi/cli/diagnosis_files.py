@@ -101,8 +101,8 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    output, same = one_of_each(d.contenders, d.experiments)
-    if same and len(output) < 2:
+    contenders, same = one_of_each(d.contenders, d.experiments)
+    if same and len(contenders) < 2:
         return d
     before = d.next_experiment
     try:
@@ -143,8 +143,8 @@ def expected(
     for word in wanted:
         if word not in VERDICTS:
             inputs.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
-    matches = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
-    largest = float(matches[1]) if matches else 0.0
+    percentage = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
+    largest = float(percentage[1]) if percentage else 0.0
     if max_error is not None and not largest > 0.0:
         inputs.add(
             f"--max-error is '{max_error}'; give a positive percentage of the range, as 0.5%."

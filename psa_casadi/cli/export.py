@@ -281,11 +281,11 @@ def ssp(
         inputs.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     inputs.attempt(lambda: chosen_platforms(wanted))
-    result = own_model(inputs, model, Fitting())
-    if result is not None and result.structure.foreign:
+    any_model = own_model(inputs, model, Fitting())
+    if any_model is not None and any_model.structure.foreign:
         inputs.refuse({"--picture": picture, "--stack": stack, "--no-compensator": no_compensator})
         inputs.check()
-        psa.export_extended(result, output, platforms=wanted)
+        psa.export_extended(any_model, output, platforms=wanted)
         show_written(output)
         return
     chosen = inputs.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
@@ -303,7 +303,7 @@ def ssp(
         save_wiring(wiring, layout_of(wiring), picture)
     show(f"parts: {', '.join(system.parts)}")
     for kind in ("input", "output"):
-        ports = [n for n, result in wiring.ports(OUTSIDE) if result == kind]
+        ports = [n for n, direction in wiring.ports(OUTSIDE) if direction == kind]
         named = (f"{n} [{wiring.unit(Port(OUTSIDE, n))}]" for n in ports)
         show(f"{kind}s: {', '.join(named)}")
     if not inputs.quiet:

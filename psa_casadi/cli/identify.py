@@ -59,15 +59,15 @@ def identify(
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
-    item = own_model(inputs, model, fitting)
+    any_model = own_model(inputs, model, fitting)
     outputs = {"--output": output, "--json": json, "--report": report}
     inputs.outputs(outputs, [*records, model, fitting.fmu])
-    if item is not None:
+    if any_model is not None:
         of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
         inputs.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
-        signals = inputs.signals(item, records, reading)
+        signals = inputs.signals(any_model, records, reading)
         work: Callable[..., psa.Identification] = partial(
-            psa.identify, item, signals, **fitting.words
+            psa.identify, any_model, signals, **fitting.words
         )
     else:
         inputs.stiffness(stiffness)
@@ -88,8 +88,8 @@ def identify(
     if isinstance(result, StackIdentification):
         text = identification_text(result, origin=origin, width=width())
     show(text)
-    for found_profile in profiles:
-        show("\n" + "\n".join(profile_sentences(found_profile)))
+    for likelihood in profiles:
+        show("\n" + "\n".join(profile_sentences(likelihood)))
     if left_out := [n for n in profile or () if n not in result.determinacy.names]:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
@@ -115,8 +115,8 @@ def _save(model: psa.Model, output: Path) -> None:
     if output.suffix.lower() not in (".fmu", ".ssv"):
         psa.save_model(model, output)
         return
-    for statement in psa.save_start_values(model, output):
-        print_message(f"Note: {statement}")
+    for sentence in psa.save_start_values(model, output):
+        print_message(f"Note: {sentence}")
 
 
 def _finish(

@@ -113,7 +113,7 @@ class Inputs:
         """Read records of a model of one's own, each in the units of its file."""
         if not paths:
             return ()
-        result = self.attempt(
+        read = self.attempt(
             lambda: psa.read_signals(
                 paths, inputs=model.input_names, outputs=model.output_names,
                 columns=reading.columns, sample_time=reading.sample_time,
@@ -122,9 +122,9 @@ class Inputs:
         lacks = [f"column '{n}' is missing" for n in model.input_names]
         if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")
-        for note in [n for s in result or () for n in s.notes if not self.quiet]:
+        for note in [n for s in read or () for n in s.notes if not self.quiet]:
             print_message(f"Note: {note}")
-        return result or ()
+        return read or ()
 
     def refuse(self, others: Mapping[str, object]) -> None:
         """Refuse the options that a model of one's own does not take, of those that are given."""
@@ -187,10 +187,10 @@ class Inputs:
         With `any_model` the file need not hold a stack.
         """
         options = {"--model": path, "--stack": stack, "--part": part}
-        items = [name for name, value in options.items() if value is not None]
-        if len(items) > 1:
-            all_of_them = "both" if len(items) == 2 else "all"
-            self.add(f"{' and '.join(items)} are {all_of_them} given; leave one of them out.")
+        named = [name for name, value in options.items() if value is not None]
+        if len(named) > 1:
+            all_of_them = "both" if len(named) == 2 else "all"
+            self.add(f"{' and '.join(named)} are {all_of_them} given; leave one of them out.")
             return None
         if part is not None:
             return self.attempt(lambda: psa.part_model(part))
@@ -229,13 +229,13 @@ class Inputs:
 
     def published(self, model: "psa.Model | None", published: Published) -> "psa.Model | None":
         """Return a model that states what the options say, else what it stated before."""
-        table = {name: text for name, text in asdict(published).items() if text is not None}
-        for name, text in table.items():
+        statements = {name: text for name, text in asdict(published).items() if text is not None}
+        for name, text in statements.items():
             if not text.strip() or not text.isprintable():
                 self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
         if model is None:
             return None
-        return replace(model, publication=replace(model.publication, **table))
+        return replace(model, publication=replace(model.publication, **statements))
 
     def stiffness(self, value: float | None) -> None:
         """Demand a positive stiffness, if one is given."""
@@ -300,15 +300,15 @@ def step_seconds(text: str) -> float:
     """
     from psa_casadi.units import parse_unit, to_si, units_of
 
-    result = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    match = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
     try:
-        number = float(result["number"]) if result else 0.0
+        number = float(match["number"]) if match else 0.0
     except ValueError:
-        result = None
-    if result and not result["unit"].strip():
-        meant = " or ".join(f"{result['number']}{unit}" for unit in ("s", "ms", "us"))
+        match = None
+    if match and not match["unit"].strip():
+        meant = " or ".join(f"{match['number']}{unit}" for unit in ("s", "ms", "us"))
         raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
-    unit = parse_unit(result["unit"], "time").name if result else ""
+    unit = parse_unit(match["unit"], "time").name if match else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))

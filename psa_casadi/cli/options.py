@@ -48,8 +48,8 @@ _ENTRY = re.compile(r"^    (\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return a function as typer takes it, with its errors told in sentences."""
-    about, item = _described(function)
-    helps = {**_SHARED, **item}
+    about, own_helps = _described(function)
+    helps = {**_SHARED, **own_helps}
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, tuple[str, ...]]] = {}
     for p in inspect.signature(function).parameters.values():
@@ -57,7 +57,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             group: Any = p.annotation
             fields = inspect.signature(group).parameters
             groups[p.name] = group, tuple(fields)
-            table = {**_SHARED, **_described(group)[1], **item}
+            table = {**_SHARED, **_described(group)[1], **own_helps}
             parameters += [_declared(q, table) for q in fields.values()]
         else:
             parameters.append(_declared(p, helps))

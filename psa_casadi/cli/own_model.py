@@ -119,12 +119,12 @@ def _made(file: Path, name: str) -> psa.Model:
             f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
         ) from error
     if not isinstance(model, psa.Model):
-        items = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
-        there = f"; it has {quoted(items)}" if items else ""
-        lacks = f"{file} has no function '{name}' that returns a model{there}. Name one that does"
+        functions = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        known = f"; it has {quoted(functions)}" if functions else ""
+        lacks = f"{file} has no function '{name}' that returns a model{known}. Name one that does"
         if not name:
-            lacks = f"say which function of {file} returns the model{there}"
-        raise InputError(f"--model: {lacks}, as {file}:{items[-1] if items else 'make'}.")
+            lacks = f"say which function of {file} returns the model{known}"
+        raise InputError(f"--model: {lacks}, as {file}:{functions[-1] if functions else 'make'}.")
     return model
 
 

@@ -60,8 +60,8 @@ def simulate(
     arguments.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
     chosen_by = Fitting(fmu=fmu, value=value if imported else None)
-    item = partial(own_model, arguments, model, chosen_by, fitted=False)
-    chosen, record = _read(arguments, item, model, stack, input_, begin, reading)
+    any_model = partial(own_model, arguments, model, chosen_by, fitted=False)
+    chosen, record = _read(arguments, any_model, model, stack, input_, begin, reading)
     turns = arguments.turns(begin.history)
     values = {} if imported else arguments.numbers("--value", value)
     starts = arguments.numbers("--start", start)
@@ -95,7 +95,7 @@ def simulate(
 
 def _read(
     inputs: Inputs,
-    own_or_none: "Callable[[], psa.Model | None]",
+    read_any_model: "Callable[[], psa.Model | None]",
     model: Path | None,
     stack: str | None,
     input_: Path,
@@ -105,16 +105,16 @@ def _read(
     """Return the model and the record of its inputs, `Signals` where it is no stack's."""
     from psa_casadi.identification.experiments import in_units
 
-    chosen = own_or_none()
+    chosen = read_any_model()
     if chosen is not None:
-        item, problems = chosen, Problems()
+        problems = Problems()
         voltage = begin.start_voltage is not None
         inputs.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
-        read = next(iter(inputs.signals(item, [input_], reading)), None)
-        signals = read and in_units(item, read, problems)
+        read = next(iter(inputs.signals(chosen, [input_], reading)), None)
+        signals = read and in_units(chosen, read, problems)
         for sentence in problems.sentences():
             inputs.add(sentence)
-        return item, signals
+        return chosen, signals
     chosen = inputs.model_or_stack(model, stack)
     columns = inputs.columns(reading.columns, [input_])
     record = None
@@ -140,8 +140,8 @@ def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
 
     every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
     units = {v.name: v.unit for v in every}
-    items = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
-    others = f", but for {', '.join(items)}" if items else ""
+    texts = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
+    others = f", but for {', '.join(texts)}" if texts else ""
     return f"the start values of the model{others}"
 
 
@@ -174,8 +174,8 @@ def _as_displayed(
     every: list[psa.Input | psa.Output] = [*model.structure.inputs, *model.structure.outputs]
     there = [v for v in every if v.name in columns]
     units = {v.name: v.display_unit or v.unit for v in there}
-    table = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
-    return psa.Signals(name=model.name, time=time, columns=table, units=units)
+    values = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
+    return psa.Signals(name=model.name, time=time, columns=values, units=units)
 
 
 def start_sentence(

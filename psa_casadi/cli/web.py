@@ -58,14 +58,14 @@ def web(
     if more.args:
         raise InputError(f"{more.args[0]}: is one file too many; give one model, by --model.")
     if diagnose:
-        item = own_model(inputs, model, fitting)
-        if (model is not None and item is None) or stack is not None or output is not None:
+        any_model = own_model(inputs, model, fitting)
+        if (model is not None and any_model is None) or stack is not None or output is not None:
             raise InputError(
                 "--diagnose serves a page of its own: leave --stack, -o and a stack's --model out;"
                 " a MODEL.json to start from is dropped there."
             )
         inputs.check()
-        _serve(port or 0, no_browser, _subject(item, model, fitting), inputs)
+        _serve(port or 0, no_browser, _subject(any_model, model, fitting), inputs)
         return
     from psa_casadi.report.page.playground import write_playground
 
@@ -88,11 +88,11 @@ def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> 
 
     if model is None:
         return Subject()
-    words = {"model": path and path.absolute(), **asdict(fitting)}
+    options = {"model": path and path.absolute(), **asdict(fitting)}
     if fitting.fmu:
-        words["fmu"] = fitting.fmu.name
+        options["fmu"] = fitting.fmu.name
     arguments: list[str] = []
-    for option, value in words.items():
+    for option, value in options.items():
         values = value if isinstance(value, list) else [value] if value else []
         begin = f"--{option.replace('_', '-')}"
         arguments += [begin if value is True else f"{begin}={v}" for v in values]

@@ -100,8 +100,8 @@ class Item:
 
     def state(self) -> dict[str, Any]:
         """Return its state for the page."""
-        table = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
-        return {**table, "held": self.held, "model": self.is_model, "seen": self.preview}
+        state = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
+        return {**state, "held": self.held, "model": self.is_model, "seen": self.preview}
 
 
 class Desk:
@@ -263,18 +263,18 @@ class Desk:
     def state(self, version: int, number: int, event_count: int) -> dict[str, Any]:
         """Return what has changed for a tab that knows a version and so many events of a run."""
         with self._lock:
-            table: dict[str, Any] = {"version": self._version}
+            state: dict[str, Any] = {"version": self._version}
             if self._run is not None:
                 self._run.look()
                 new = self._run.events[event_count if number == self._number else 0 :]
-                table["run"] = {**self._run.state(), "number": self._number, "events": new}
-            table["export"] = None if self._export is None else self._export.state()
+                state["run"] = {**self._run.state(), "number": self._number, "events": new}
+            state["export"] = None if self._export is None else self._export.state()
             if version != self._version:
-                table["items"] = [i.state() for i in self._items.values()]
-                table["settings"] = vars(self._settings)
-                table["result"] = runs.diagnosis_summary(self.folder)
-                table["files"] = runs.files_left(self.folder)
-            return table
+                state["items"] = [i.state() for i in self._items.values()]
+                state["settings"] = vars(self._settings)
+                state["result"] = runs.diagnosis_summary(self.folder)
+                state["files"] = runs.files_left(self.folder)
+            return state
 
     def result(self, name: str) -> Path | None:
         """Return the place of a file that a run has left, None where there is none of this name."""

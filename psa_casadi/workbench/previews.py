@@ -63,8 +63,8 @@ def preview(
         return _problem(
             f"{path.name}: the process that read it has ended; the file is damaged or too large."
         )
-    table: dict[str, Any] = json.loads(done.stdout)
-    return table
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
 
 
 def looked_at(
@@ -77,7 +77,7 @@ def looked_at(
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what `preview` returns of a file in this folder, read in this process."""
-    head, problems, output = None, [], None
+    head, problems, record_summary = None, [], None
     names = (*inputs, *outputs)
     try:
         wanted = parse_columns(columns, names) if columns else {}
@@ -87,21 +87,21 @@ def looked_at(
             signals, *_ = read_signals(
                 file, inputs=inputs, outputs=outputs, columns=wanted, sample_time=sample_time
             )
-            output = _signals_summary(signals, inputs)
+            record_summary = _signals_summary(signals, inputs)
         else:
             record, *_ = read_records(
                 [file], columns=wanted, sample_time=sample_time, need_excitation=not held
             )
-            output = _record_summary(record)
+            record_summary = _record_summary(record)
     except InputError as error:
         problems = list(error.problems)
-    table = _problem(*problems)
+    answer = _problem(*problems)
     if head is not None:
         guess = {name: [f.index, f.unit] for name, f in head.guess.items()}
-        table["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
-        table["head"]["guess"] = guess
-    table["record"] = output
-    return table
+        answer["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
+        answer["head"]["guess"] = guess
+    answer["record"] = record_summary
+    return answer
 
 
 def _problem(*sentences: str) -> dict[str, Any]:
@@ -189,8 +189,8 @@ def main() -> None:
     content = json.loads(sys.argv[1])
     out = sys.stdout
     with contextlib.redirect_stdout(sys.stderr):  # libraries may print
-        table = looked_at(**content)
-    json.dump(table, out, allow_nan=False)
+        answer = looked_at(**content)
+    json.dump(answer, out, allow_nan=False)
 
 
 if __name__ == "__main__":

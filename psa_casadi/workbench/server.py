@@ -78,11 +78,11 @@ def page(effects: Sequence[str], subject: Subject) -> str:
     """Return the page; `effects` are those that a person may leave out of the search."""
     outputs = [subject.units[name] for name in subject.outputs]
     unit = "m" if not outputs else outputs[0] if len(outputs) == 1 else ""
-    table = {"effects": list(effects), "columns": subject.columns, "unit": unit}
+    setup_data = {"effects": list(effects), "columns": subject.columns, "unit": unit}
     template = environment().from_string(_PAGE.joinpath("workbench.html").read_text("utf-8"))
-    markup = Markup(json.dumps(table).replace("<", "\\u003c"))
+    setup = Markup(json.dumps(setup_data).replace("<", "\\u003c"))
     return template.render(
-        style=_STYLE, script=_SCRIPT, version=__version__, setup=markup, stack=not outputs
+        style=_STYLE, script=_SCRIPT, version=__version__, setup=setup, stack=not outputs
     )
 
 
@@ -192,11 +192,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _look_at_cookie(self, why: str) -> None:
         """Refuse what has not the cookie, or is caused by another site."""
-        result = None
+        cookie = None
         if self.headers.get("Sec-Fetch-Site", "none") in _OWN:
             with contextlib.suppress(CookieError):
-                result = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
-        if result is None or not _same(result.value, self.server.session):
+                cookie = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
+        if cookie is None or not _same(cookie.value, self.server.session):
             raise _RefusedError(HTTPStatus.FORBIDDEN, why)
 
     def _get(self) -> None:

@@ -27,6 +27,6 @@ class Subject:
         """The columns of its records, each with the units that it may have, the model's first."""
         if not self.units:
             return {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()}
-        table = {n: units_of(parse_unit(u).quantity) for n, u in self.units.items()}
-        item = {n: list(dict.fromkeys([u, *table[n]])) for n, u in self.units.items()}
-        return {"time": list(units_of("time")), **item}
+        units = {n: units_of(parse_unit(u).quantity) for n, u in self.units.items()}
+        columns = {n: list(dict.fromkeys([u, *units[n]])) for n, u in self.units.items()}
+        return {"time": list(units_of("time")), **columns}

@@ -122,10 +122,10 @@ def damage(folder: Path, device_file: DeviceFile) -> str:
     for name, sha256 in zip(device_file.files, device_file.sha256, strict=False):
         path = folder / name
         try:
-            text = hash_of(path.read_bytes())
+            digest = hash_of(path.read_bytes())
         except OSError as error:
             return f"{path}: cannot be read ({error.strerror}); run `psa batch` again."
-        if text != sha256:
+        if digest != sha256:
             return f"{path}: is damaged, as it is not what was written; run `psa batch` again."
     return ""
 
@@ -462,7 +462,7 @@ def identification_file(
                 )
             )  # fmt: skip
     doubts = [d for d in identification.doubts if isinstance(d, Note) and d.code in _MISSED]
-    items = [float(d.values[_MISSED[d.code]]) for d in doubts]
+    misses = [float(d.values[_MISSED[d.code]]) for d in doubts]
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
@@ -479,7 +479,7 @@ def identification_file(
             for a in (stack.advice if stack else ())
         ),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
-        missed=max(items, default=None),
+        missed=max(misses, default=None),
         noise_kinds=identification.noise_kinds,
     )
     return asdict(content)
@@ -596,14 +596,14 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     """
     source = os.fspath(path)
     content = read_json(source, f"{_READ_ADVICE}.")
-    output, result = diagnosis_in(content, source)
-    if output is None:
-        raise InputError(f"{source}: its format is {shown(result)}, no diagnosis; {_READ_ADVICE}.")
-    return output
+    diagnosis, kind = diagnosis_in(content, source)
+    if diagnosis is None:
+        raise InputError(f"{source}: its format is {shown(kind)}, no diagnosis; {_READ_ADVICE}.")
+    return diagnosis
 
 
 def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFile | None, Any]:
     """Return the diagnosis that a file's content is, None if it is none, and its format."""
-    result = content.get("format") if isinstance(content, dict) else None
-    kind = DIAGNOSES.get(result) if isinstance(result, str) else None
-    return None if kind is None else decode(kind, content, source), result
+    name = content.get("format") if isinstance(content, dict) else None
+    kind = DIAGNOSES.get(name) if isinstance(name, str) else None
+    return None if kind is None else decode(kind, content, source), name

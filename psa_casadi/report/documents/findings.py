@@ -90,40 +90,40 @@ def device_finding(
     damaged = damage(folder, device_file)
     if damaged:
         raise InputError(damaged)
-    (result,) = _joined(
+    (joined,) = _joined(
         [r for name in device_file.files for r in _read(folder / name, effects, traces)]
     )
     day = date.fromisoformat(device_file.date) if device_file.date else None
-    return replace(result[1], device=device_file.device, batch=device_file.batch, day=day)
+    return replace(joined[1], device=device_file.device, batch=device_file.batch, day=day)
 
 
 def _read(
-    inputs: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
+    result: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
-    if isinstance(inputs, AnyDiagnosisFile):
-        return [(Path(inputs.records[0].name), _diagnosis(inputs))]
-    if isinstance(inputs, Identification):
-        path, source = Path(inputs.experiments[0].record.name), "identification"
-        content = identification_file(inputs)
-    elif isinstance(inputs, Diagnosis):
-        path = Path(inputs.experiments[0].record.name)
-        content = inputs.to_dict()
+    if isinstance(result, AnyDiagnosisFile):
+        return [(Path(result.records[0].name), _diagnosis(result))]
+    if isinstance(result, Identification):
+        path, source = Path(result.experiments[0].record.name), "identification"
+        content = identification_file(result)
+    elif isinstance(result, Diagnosis):
+        path = Path(result.experiments[0].record.name)
+        content = result.to_dict()
         finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
-        return [(path, _with_model(finding, _model(inputs.model, traces)))]
+        return [(path, _with_model(finding, _model(result.model, traces)))]
     else:
-        path = Path(inputs) / DEVICE_FILE if Path(inputs).is_dir() else Path(inputs)
+        path = Path(result) / DEVICE_FILE if Path(result).is_dir() else Path(result)
         source = str(path)
         content = read_json(path, _ADVICE)
     diagnosis, kind = diagnosis_in(content, source)
     if diagnosis is not None:
         return [(path, _diagnosis(diagnosis))]
     if kind == DEVICE:
-        text = decode(DeviceFile, content, source)
-        if text.status != "done":
-            why = " ".join(text.problems)
-            raise InputError(f"{path}: the work on this device was {text.status}: {why}")
-        return [(path, device_finding(path.parent, text, effects, traces=traces))]
+        device_file = decode(DeviceFile, content, source)
+        if device_file.status != "done":
+            why = " ".join(device_file.problems)
+            raise InputError(f"{path}: the work on this device was {device_file.status}: {why}")
+        return [(path, device_finding(path.parent, device_file, effects, traces=traces))]
     if kind == IDENTIFICATION:
         return [(path, _identification(decode(IdentificationFile, content, source)))]
     if kind == MODEL:
@@ -215,17 +215,17 @@ def _joined(reads: Sequence[_Read]) -> list[_Read]:
     """Join every model to the first finding of the same records that has none yet."""
     rows = dict(enumerate(reads))
     full: set[int] = set()
-    for k, (_, item) in enumerate(reads):
+    for k, (_, model) in enumerate(reads):
         same = [
             j
             for j, (_, other) in enumerate(reads)
-            if item.kind == "model" != other.kind and j not in full
-            if item.records and {s for _, s in item.records} == {s for _, s in other.records}
+            if model.kind == "model" != other.kind and j not in full
+            if model.records and {s for _, s in model.records} == {s for _, s in other.records}
         ]
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            rows[same[0]] = path, _with_model(finding, item)
+            rows[same[0]] = path, _with_model(finding, model)
             del rows[k]
     return list(rows.values())
 
@@ -260,8 +260,8 @@ def _named(reads: Sequence[_Read]) -> tuple[Finding, ...]:
     out: list[Finding] = []
     for name, (_, finding) in zip(names, reads, strict=True):
         counted[name] += 1
-        item = name if counted[name] == 1 else f"{name} ({counted[name]})"
-        out.append(replace(finding, device=item))
+        unique = name if counted[name] == 1 else f"{name} ({counted[name]})"
+        out.append(replace(finding, device=unique))
     return tuple(out)
 
 

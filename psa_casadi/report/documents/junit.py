@@ -21,15 +21,15 @@ class Case:
 def check_cases(report: CheckReport) -> list[Case]:
     """Return every check of an FMU as a test."""
     table = check_table(report)
-    items = [dict(zip(table.head, row, strict=True)) for row in table.rows]
+    rows = [dict(zip(table.head, row, strict=True)) for row in table.rows]
     texts = [
         f"found {row['found']}, allowed {row['allowed']}" if "found" in row else row["clause"]
-        for row in items
+        for row in rows
     ]
     cases = []
-    for row, text, r in zip(items, texts, report.rows, strict=True):
-        statement = ": ".join(filter(None, (text, row["remark"])))
-        cases.append(Case(row["check"], statement, "" if r.passed else statement))
+    for row, text, r in zip(rows, texts, report.rows, strict=True):
+        sentence = ": ".join(filter(None, (text, row["remark"])))
+        cases.append(Case(row["check"], sentence, "" if r.passed else sentence))
     return cases
 
 

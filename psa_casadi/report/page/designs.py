@@ -184,12 +184,12 @@ def _responses(
     """Return the plot of a predicted output, less the rivals' mean where there are several."""
     several = len(responses) > 1
     middle = np.mean(list(responses.values()), axis=0) if several else np.zeros(record.n)
-    table = {n: y - middle for n, y in responses.items()}
-    largest = max(float(np.max(np.abs(y))) for y in table.values())
+    deviations = {n: y - middle for n, y in responses.items()}
+    largest = max(float(np.max(np.abs(y))) for y in deviations.values())
     scale = length_scale(largest) if unit == "m" else prefixed_scale(largest, unit)
     name = output.removeprefix("measured_")
     plot = Panel("time [s]", in_brackets(name, scale.unit), 340)
-    for (rival, y), colour in zip(table.items(), _COLOURS * len(table), strict=False):
+    for (rival, y), colour in zip(deviations.items(), _COLOURS * len(deviations), strict=False):
         plot.line(record.time, scale.factor * y, plain(rival), colour)
     caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
     note = (
@@ -258,10 +258,10 @@ def _root_locus(d: MechanismDesign) -> Panel:
         (lag, "lag, cannot be moved", colours.INK, "square"),
     ):
         plot.marks(1e-3 * poles.real, 1e-3 * poles.imag, name, colour, 10, symbol)
-    displayed = np.concatenate([d.free_poles, d.poles, lag])
-    displayed = displayed[np.abs(displayed) < 4.0 * np.abs(d.free_poles).max()]
-    reach = 1.15e-3 * max(float(np.abs(displayed.real).max()), float(np.abs(displayed.imag).max()))
-    left = max(1.3e-3 * float(np.abs(displayed.real).max()), 0.3 * reach)
+    near = np.concatenate([d.free_poles, d.poles, lag])
+    near = near[np.abs(near) < 4.0 * np.abs(d.free_poles).max()]
+    reach = 1.15e-3 * max(float(np.abs(near.real).max()), float(np.abs(near.imag).max()))
+    left = max(1.3e-3 * float(np.abs(near.real).max()), 0.3 * reach)
     ratio, edge = min(d.reached.damping, 1.0), np.array([0.0, reach])
     for sign, name in ((-1.0, ""), (1.0, f"damping ratio {number(ratio, 3)}")):
         height = sign * np.sqrt(1.0 - ratio**2) * edge

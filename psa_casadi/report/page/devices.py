@@ -50,10 +50,10 @@ class Comparison:
     @property
     def tables(self) -> tuple[Table, ...]:
         """Verdicts with held-out errors of every output, and the parameters, if any are shared."""
-        items = [words.verdict_table(self.findings, words.error_scale(self.findings))]
+        tables = [words.verdict_table(self.findings, words.error_scale(self.findings))]
         if self.differences:
-            items.append(words.difference_table(self.findings, self.differences))
-        return tuple(t for t in items if len(t.head) > 1)  # of models alone only names
+            tables.append(words.difference_table(self.findings, self.differences))
+        return tuple(t for t in tables if len(t.head) > 1)  # of models alone only names
 
     def __repr__(self) -> str:
         """Return the sentence and the tables."""
@@ -164,7 +164,7 @@ def write_population(
     badges = [f"{len(p.findings)} devices"]
     badges += [f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"] if batches else []
     counts = Counter(o.parameter for o in p.outliers)
-    displayed = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
+    spreads = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
     page = render(
         "population.html",
         "Population of devices",
@@ -176,8 +176,7 @@ def write_population(
         **words.population_tables(p),
         left_out=words.left_out_sentence(p),
         spread_pictures=[
-            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning)
-            for s in displayed
+            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in spreads
         ],
         drift_pictures=[
             Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))

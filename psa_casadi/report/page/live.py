@@ -98,13 +98,13 @@ class LiveModel:
         module = self.module.result()
         if module is None:
             return None
-        displayed = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
-        first, counts = displayed[0].series, any(r.series.counts for r in self.records)
-        largest = max(float(np.nanmax(np.abs(r.residual))) for r in displayed)
+        records = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
+        first, counts = records[0].series, any(r.series.counts for r in self.records)
+        largest = max(float(np.nanmax(np.abs(r.residual))) for r in records)
         length = handy_scale(first.span, counts=counts)
         error = length_scale(largest or 1e-2 * first.span, counts=counts)
-        limit, rows = _SAMPLES // len(displayed), []
-        for r in displayed:
+        limit, rows = _SAMPLES // len(records), []
+        for r in records:
             s = r.series  # of a stack all records have the same units
             units = (s.scale, s.residual_scale) if s.unit else (length, error)
             over = f"{s.title} over {r.along}" if r.along else ""
@@ -166,9 +166,9 @@ def live_design(
     `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
     to follow, where there is one. The model begins in motion, or at `rest`.
     """
-    time, voltage, displayed = record
-    aim, words = (displayed, "design") if wanted is None else (wanted, "path")
-    curve, none = Curve("model", colours.EXTENDED, displayed), np.zeros(len(time), dtype=bool)
+    time, voltage, displacement = record
+    aim, words = (displacement, "design") if wanted is None else (wanted, "path")
+    curve, none = Curve("model", colours.EXTENDED, displacement), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
@@ -179,10 +179,10 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
     s, time = model.structure, record.time - record.time[0]
     start = np.array([q.start for q in s.states])
     u = input_samples(model, record.n, record.columns)
-    displayed = run(model, time, u, start, hold=record.hold).y.T
+    outputs = run(model, time, u, start, hold=record.hold).y.T
     along, none = next(iter(record.columns)), np.zeros(record.n, dtype=bool)
     rows = []
-    for output, y in zip(s.outputs, displayed, strict=True):
+    for output, y in zip(s.outputs, outputs, strict=True):
         series = Series(
             output.name, time, record.columns[along], y, (Curve("model", colours.EXTENDED, y),),
             none, noise=0.0, counts=False, quantity=output.name, unit=output.unit,
@@ -299,7 +299,7 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         file = dumps(model)
     except InputError:  # no file holds such a model
         file = None
-    displayed, s, known = output_of(model), model.structure, determined(model)
+    main, s, known = output_of(model), model.structure, determined(model)
     nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
         "name": model.name,
@@ -311,8 +311,8 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         "states": [{**_variable(q), "start": q.start} for q in s.states],
         "nominals": model.state_nominals().tolist(),
         "error_sizes": model.error_sizes().tolist(),
-        "shown": displayed,
-        "shown_nominal": 0.0 if displayed is None else float(nominals[displayed]),
+        "shown": main,
+        "shown_nominal": 0.0 if main is None else float(nominals[main]),
         "starts_itself": model.starts_itself,
         "file": file,
     }

@@ -46,20 +46,20 @@ def write_playground(path: str | os.PathLike[str], model: Model | None = None) -
 
 def playground(model: Model | None = None) -> str:
     """Return the page; see `write_playground`."""
-    inputs = stack_model(STACK) if model is None else model
-    if "voltage" not in inputs.input_names or "displacement" not in inputs.output_names:
+    stack = stack_model(STACK) if model is None else model
+    if "voltage" not in stack.input_names or "displacement" not in stack.output_names:
         raise InputError(
-            [f"The model '{inputs.name}' has no voltage input or no displacement output: no stack."]
+            [f"The model '{stack.name}' has no voltage input or no displacement output: no stack."]
         )
-    whole = inputs.with_declared_starts()
+    whole = stack.with_declared_starts()
     for effect in EFFECTS.values():
         if not {p.name for p in effect.parameters} & set(whole.parameter_names):
             whole = whole.with_effect(effect)
-    title = next((n for n in STACKS if stack_model(n).name == inputs.name), inputs.name)
-    stacks = [_stack(inputs, whole, title, inputs.description)]
+    title = next((n for n in STACKS if stack_model(n).name == stack.name), stack.name)
+    stacks = [_stack(stack, whole, title, stack.description)]
     # the terms of a model that states some are not those of other stacks
-    names = {c.name for c in inputs.components}
-    if not inputs.publication.stated and names >= {c.name for c in BASE}:
+    names = {c.name for c in stack.components}
+    if not stack.publication.stated and names >= {c.name for c in BASE}:
         others = [name for name in STACKS if name != title]
         stacks += [_stack(stack_model(n), whole, n, STACKS[n].description) for n in others]
     table = {

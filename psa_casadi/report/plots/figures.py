@@ -106,8 +106,8 @@ def figure_of(result: Plotted) -> Figure:
         return diagnosis_figure(result)
     if isinstance(result, StackIdentification):
         series = series_of_fit(result)
-        figure, grid, displayed = _sheet(series, "measured", "model")
-        _draw_residual(figure.add_subplot(grid[1, :]), displayed)
+        figure, grid, worst = _sheet(series, "measured", "model")
+        _draw_residual(figure.add_subplot(grid[1, :]), worst)
         return figure
     if isinstance(result, Trajectory):
         return response_figure(result.time, result.voltage, result.displacement)
@@ -124,8 +124,8 @@ def figure_of(result: Plotted) -> Figure:
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
-    figure, grid, displayed = _sheet(series_of(diagnosis), origin, "base model", verdict)
-    _draw_residual(figure.add_subplot(grid[1, :2]), displayed)
+    figure, grid, worst = _sheet(series_of(diagnosis), origin, "base model", verdict)
+    _draw_residual(figure.add_subplot(grid[1, :2]), worst)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
     part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
@@ -180,21 +180,21 @@ def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
 _LINES, _NOTHING = ("-", "--", "-.", ":"), 1e-9
 
 
-def bode_figure(of: Linear) -> Figure:
+def bode_figure(linear: Linear) -> Figure:
     """Return gain and phase of every output over every input of a linearised model.
 
     A column for each input; frequencies from a decade below the slowest pole to one above the
     fastest.
     """
-    sizes = np.abs(of.poles)[np.abs(of.poles) > 0] / (2 * np.pi)
+    sizes = np.abs(linear.poles)[np.abs(linear.poles) > 0] / (2 * np.pi)
     low, high = (float(f(sizes)) if sizes.size else 1.0 for f in (np.min, np.max))
     hertz = np.geomspace(0.1 * low, 10.0 * high, 1500)
-    result = of.response(2 * np.pi * hertz)
-    figure = sheet((4.5 * max(2, len(of.inputs)), 7.0), DPI)
-    rows = figure.subplots(2, len(of.inputs), sharex=True, squeeze=False)
-    for k, i in enumerate(of.inputs):
-        for j, o in enumerate(of.outputs):
-            of_one = result[:, j, k]
+    response = linear.response(2 * np.pi * hertz)
+    figure = sheet((4.5 * max(2, len(linear.inputs)), 7.0), DPI)
+    rows = figure.subplots(2, len(linear.inputs), sharex=True, squeeze=False)
+    for k, i in enumerate(linear.inputs):
+        for j, o in enumerate(linear.outputs):
+            of_one = response[:, j, k]
             size, usual = (nominal_value(v.nominal, {}) for v in (i, o))
             if np.max(np.abs(of_one)) * size > _NOTHING * usual:  # else it is rounding
                 style_of = {"color": f"C{j}", "linestyle": _LINES[j % len(_LINES)]}
@@ -233,12 +233,10 @@ def _sheet(
     figure = sheet(SIZE_INCHES, DPI)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     grid = figure.add_gridspec(2, 3, **ratios)
-    displayed, window = records.samples(s, _MOST_POINTS), telling_window(s)
+    indices, window = records.samples(s, _MOST_POINTS), telling_window(s)
     whole, part, loop = (figure.add_subplot(grid[0, k]) for k in range(3))
     draw(
-        whole,
-        records.measured_plot(s, origin, displayed),
-        f"{s.title} (box: the part on the right)",
+        whole, records.measured_plot(s, origin, indices), f"{s.title} (box: the part on the right)"
     )
     ends = s.time_scale.factor * s.time[window][[0, -1]]
     whole.axvspan(*ends, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
@@ -247,7 +245,7 @@ def _sheet(
         "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
     )
     draw(part, records.zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
-    draw(loop, records.loop_plot(s, origin, displayed), "Loop", legend={"loc": "upper left"})
+    draw(loop, records.loop_plot(s, origin, indices), "Loop", legend={"loc": "upper left"})
     which = f"{origin} record: {s.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the {model} misses most)"
@@ -333,17 +331,14 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         if name == "residual":
             _draw_residual(axes, most_telling(series))
         else:
-            displayed = most_telling([s for s in series if s.quantity == name])
-            whole = replace(displayed, held_out=np.zeros(len(displayed.time), dtype=bool))
+            worst = most_telling([s for s in series if s.quantity == name])
+            whole = replace(worst, held_out=np.zeros(len(worst.time), dtype=bool))
             draw(
-                axes,
-                records.measured_plot(whole, "measured", slice(None)),
-                displayed.title,
-                legend={},
+                axes, records.measured_plot(whole, "measured", slice(None)), worst.title, legend={}
             )
             axes.margins(x=0.01)
-    matches: Figure | SubFigure = axes.figure
-    return matches if isinstance(matches, Figure) else matches.figure
+    parent: Figure | SubFigure = axes.figure
+    return parent if isinstance(parent, Figure) else parent.figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
@@ -433,14 +428,14 @@ def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) 
     ends = np.array([np.nanmin(y), np.nanmax(y)])
     size = 3.0 * np.ptp(ends) if is_prior else np.nanmax(np.abs(y - middle))
     scale = _scale(posterior, block, float(size))
-    low, high, displayed = (scale.factor * (v - middle) for v in (low, high, y))
+    low, high, measured = (scale.factor * (v - middle) for v in (low, high, y))
     if not is_prior:  # measured comes first in its legend
-        axes.plot(time, displayed, color=colours.MEASURED, linewidth=0.8, label="measured")
+        axes.plot(time, measured, color=colours.MEASURED, linewidth=0.8, label="measured")
     colour, alpha, order = look
     band = f"{group}, {100.0 * HDI:.0f} %"
     axes.fill_between(time, low, high, color=colour, alpha=alpha, label=band, zorder=order)
     if is_prior:
-        axes.plot(time, displayed, color=colours.MEASURED, linewidth=1.0, label="measured")
+        axes.plot(time, measured, color=colours.MEASURED, linewidth=1.0, label="measured")
         axes.set_ylim(*(scale.factor * (np.mean(ends) + np.array([-1.5, 1.5]) * np.ptp(ends))))
     style(axes, title, "time [s]", phrases.in_brackets(name, scale.unit))
     axes.legend(fontsize=FONT - 1, loc="upper right")

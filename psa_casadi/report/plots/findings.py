@@ -166,8 +166,8 @@ def correction_plot(d: Diagnosis, c: Correction) -> tuple[str, Panel]:
     """
     if isinstance(c, FreeFunction):
         largest = float(np.max(np.abs(c.along), initial=0.0))
-        observed = phrases.prefixed_scale(largest, c.variable_unit or "1")
-        at, added, name, unit = observed.factor * c.along, c.added, c.variable, observed.unit
+        coordinate = phrases.prefixed_scale(largest, c.variable_unit or "1")
+        at, added, name, unit = coordinate.factor * c.along, c.added, c.variable, coordinate.unit
         scale = phrases.prefixed_scale(float(np.max(np.abs(added), initial=0.0)), c.unit)
     elif isinstance(c, Patch):
         k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
@@ -197,12 +197,12 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     """One bar for every parameter: its standard error over its value, on a logarithmic axis."""
     fitted = sorted((g for g in graded if g.degree != "fixed"), key=lambda g: g.error)
     rows = [*fitted, *(g for g in graded if g.degree == "fixed")]
-    items = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
-    left = 10.0 ** math.floor(math.log10(min([1.0, *items]) * 0.5))
-    right = max([100.0, *items]) * 15.0
+    percents = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
+    left = 10.0 ** math.floor(math.log10(min([1.0, *percents]) * 0.5))
+    right = max([100.0, *percents]) * 15.0
     plot = Panel("relative standard error [%]", height=_MARGINS + _BAR * len(rows))
     for degree in DEGREES:
-        group = [(g, x) for g, x in zip(fitted, items, strict=True) if g.degree == degree]
+        group = [(g, x) for g, x in zip(fitted, percents, strict=True) if g.degree == degree]
         if group:
             names = [g.name for g, _ in group]
             plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
@@ -236,19 +236,19 @@ def correlation_plot(identification: Identification) -> Panel:
     plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
              for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
-    for sign, colour, statement in (
+    for sign, colour, name in (
         (1.0, colours.EXTENDED, "positive"),
         (-1.0, colours.BASE, "negative"),
     ):
-        items = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
-        look = {"color": colour, "opacity": [abs(v) for _, _, v in items]}
+        part = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
+        look = {"color": colour, "opacity": [abs(v) for _, _, v in part]}
         plot.bars(  # a cell is a bar that begins at its column
-            [0.92] * len(items), [names[i] for i, _, _ in items], statement, look, width=0.92,
-            base=[k - 0.46 for _, k, _ in items],
-            text=[_correlation_text(v) if written and i > k else "" for i, k, v in items],
+            [0.92] * len(part), [names[i] for i, _, _ in part], name, look, width=0.92,
+            base=[k - 0.46 for _, k, _ in part],
+            text=[_correlation_text(v) if written and i > k else "" for i, k, v in part],
             textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
             textfont={"size": 10, "color": colours.INK},
-            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in items],
+            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in part],
             hovertemplate="%{hovertext}<extra></extra>",
         )  # fmt: skip
     bare = {"showgrid": False, "ticks": "", "mirror": False, "showline": False, "automargin": True}
@@ -286,8 +286,8 @@ def profile_plot(p: Profile) -> Panel:
     else:
         at = np.linspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = (at - p.estimate) / p.standard_error
-    displayed = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
-    plot.line(displayed, away**2, "linearised", colours.NOISE, dash="dot")
+    values_at = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
+    plot.line(values_at, away**2, "linearised", colours.NOISE, dash="dot")
     low, high = (
         edge if end is None else convert(end, p.unit, p.display_unit)
         for end, edge in ((p.low, span[0]), (p.high, span[1]))

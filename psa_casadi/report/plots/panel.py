@@ -160,8 +160,8 @@ def logarithmic(values: tuple[float, float]) -> dict[str, Any]:
 
 def plotly_figure(panel: Panel, hold: Callable[[str], Any] = str) -> dict[str, Any]:
     """Return what plotly reads; `hold` keeps a long array and returns what stands for it."""
-    table: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
-    return table
+    content: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
+    return content
 
 
 def _encoded(value: Any, key: str, hold: Callable[[str], Any]) -> Any:
@@ -220,9 +220,9 @@ def style(axes: Axes, title: str, x: str, y: str, *, font: float = FONT) -> None
 
 
 def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
-    displayed = t["name"] if t.get("showlegend", True) else None
+    label_text = t["name"] if t.get("showlegend", True) else None
     if t["type"] == "bar":
-        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=displayed)
+        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=label_text)
         return
     if t["mode"] == "text":
         for x, y, text in zip(t["x"], t["y"], t["text"], strict=True):
@@ -232,7 +232,7 @@ def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
     look = line or marker or {}
     errors = t.get("error_y")
     axes.errorbar(
-        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=displayed,
+        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=label_text,
         color=look["color"], linestyle=_DASHES[line.get("dash", "solid")] if line else "none",
         linewidth=_POINTS * line["width"] if line else 0.0, elinewidth=0.8,
         marker=_SYMBOLS[marker.get("symbol", "circle")] if marker else None,

@@ -42,7 +42,7 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
     model = design.rivals[0].model
     capacitance = model.values.get("C_p") if is_stack(model) else None
-    statement = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
+    promises = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
     record, parts = design.record, []
     for name, values in record.columns.items():
         unit, rate = (
@@ -50,18 +50,18 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
             float(np.max(np.abs(np.diff(values) / np.diff(record.time)))),
         )
         current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
-        displayed = "" if unit == "1" else f" {unit}"
-        each = f"{displayed} a second" if displayed == "" or "/" in unit else f"{displayed}/s"
+        in_unit = "" if unit == "1" else f" {unit}"
+        per_second = f"{in_unit} a second" if in_unit == "" or "/" in unit else f"{in_unit}/s"
         named = f"{name} " if len(record.columns) > 1 else ""
         parts.append(
-            f"{named}{number(values.min())} to {number(values.max())}{displayed}, at most"
-            f" {number(rate)}{each}{current}"
+            f"{named}{number(values.min())} to {number(values.max())}{in_unit}, at most"
+            f" {number(rate)}{per_second}{current}"
         )
     inputs = (
         f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
         f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
     )
-    return (*statement, inputs)
+    return (*promises, inputs)
 
 
 def _chances(design: Separated) -> tuple[str, ...]:

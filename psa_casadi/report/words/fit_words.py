@@ -58,17 +58,15 @@ def grade(identification: Identification, name: str) -> Grade:
     return Grade(name, error, degree, by_change=not parameter.log)
 
 
-def determined(
-    model: Model, stack_identification: StackIdentification | None = None
-) -> frozenset[str]:
+def determined(model: Model, identification: StackIdentification | None = None) -> frozenset[str]:
     """Return the parameters that the records determine, if only weakly.
 
     Without the identification that found them they are those whose 95 % interval is that of a
     standard error below `DETERMINED_WIDTH`.
     """
-    if stack_identification is not None:
-        known = {g.name for g in grades(stack_identification) if g.degree in ("determined", "weak")}
-        return frozenset(known | set(stack_identification.read_off))
+    if identification is not None:
+        known = {g.name for g in grades(identification) if g.degree in ("determined", "weak")}
+        return frozenset(known | set(identification.read_off))
     narrow = set()
     for name, interval in model.provenance.intervals.items():
         parameter = model.parameter(name)
@@ -151,11 +149,11 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
     """Say which parameters are known only together."""
     if not pairs:
         return f"No two estimates correlate by more than {STRONG_CORRELATION}."
-    items = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
+    texts = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
     more = f", and {len(pairs) - 6} pairs more" if len(pairs) > 6 else ""
     return (
         "Known only together, since one can make up for a change of the other:"
-        f" {', '.join(items)}{more}."
+        f" {', '.join(texts)}{more}."
     )
 
 

@@ -60,8 +60,8 @@ def weight(m: Misfit) -> float:
 
 def strongest(misfits: Sequence[Misfit]) -> Note | None:
     """Return what says most of what is wrong, None if nothing is above the noise."""
-    items = [m for m in misfits if len(m.findings) > 1]
-    return max(items, key=weight).findings[1] if items else None
+    above_noise = [m for m in misfits if len(m.findings) > 1]
+    return max(above_noise, key=weight).findings[1] if above_noise else None
 
 
 MISFIT: Mapping[str, Callable[..., str]] = {

@@ -329,8 +329,8 @@ def _identification(identification: Identification) -> str:
         f"  {n}: {v:.3g} rms left, noise {identification.noise[n]:.3g}"
         for n, v in identification.rms.items()
     ]
-    items = [f"  {w}" for w in identification.warnings]
-    return "\n".join([f"identified '{model.name}':", *rows, *left, *items])
+    warnings = [f"  {w}" for w in identification.warnings]
+    return "\n".join([f"identified '{model.name}':", *rows, *left, *warnings])
 
 
 def _estimate(value: float, low: float, high: float) -> str:

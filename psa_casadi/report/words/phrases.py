@@ -78,8 +78,8 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
 def prefixed_scale(largest: float, unit: str) -> Scale:
     """Return a unit with the prefix that makes `largest` a handy number; compounds have none."""
     if unit in _PREFIXED and largest > 0:
-        result = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
-        return Scale(result[0] + unit, 1.0 / result[1])
+        prefix = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
+        return Scale(prefix[0] + unit, 1.0 / prefix[1])
     return Scale("" if unit == "1" else unit, 1.0)
 
 
@@ -175,8 +175,8 @@ _LIKELIHOOD = (
 
 def confidence_text(confidence: float) -> str:
     """Return how sure a cause is, as a number and in words."""
-    displayed = round(confidence, 2)
-    words = next((w for least, w in _LIKELIHOOD if displayed >= least), "unlikely")
+    rounded = round(confidence, 2)
+    words = next((w for least, w in _LIKELIHOOD if rounded >= least), "unlikely")
     return f"confidence {percent(confidence)}: {words}"
 
 
@@ -195,10 +195,10 @@ def share_text(candidate: Candidate, d: Diagnosis) -> str:
     if len(d.causes) < 2:
         return alone
     named = {c.effect for c in d.causes}
-    item = next(
+    share = next(
         (c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None
     )
-    return alone if item is None else f"{alone}; with others {item.percents[0]} %"
+    return alone if share is None else f"{alone}; with others {share.percents[0]} %"
 
 
 def rest_sentence(d: Diagnosis) -> str:

@@ -131,25 +131,25 @@ def population_tables(p: population.Population) -> dict[str, Table]:
     outliers, rows, batches, drifts = [], [], [], []
     for o in p.outliers:
         s, place = spreads[o.parameter], devices[o.device]
-        result, displayed = p.findings[place], _ParameterText(s.estimates)
+        finding, text = p.findings[place], _ParameterText(s.estimates)
         mean, half = float(s.common.b[0]), NORMAL_95 * s.common.tau
         theta = float(s.estimates.theta[s.estimates.places.index(place)])
         outliers.append(
-            (o.device, result.batch, result.day.isoformat() if result.day else "", o.parameter,
-             displayed.value(theta), displayed.interval((mean - half, mean + half)), number(o.z, 3),
+            (o.device, finding.batch, finding.day.isoformat() if finding.day else "", o.parameter,
+             text.value(theta), text.interval((mean - half, mean + half)), number(o.z, 3),
              _p(o.p_adjusted))
         )  # fmt: skip
     for name, s in spreads.items():
-        c, displayed = s.common, _ParameterText(s.estimates)
+        common, text = s.common, _ParameterText(s.estimates)
         rows.append(
             (
                 name,
                 str(len(s.estimates.places)),
-                displayed.value(float(c.b[0])),
-                displayed.interval(c.interval()),
-                displayed.spread(c.tau),
-                displayed.spreads(c.tau_interval),
-                _p(c.p_value),
+                text.value(float(common.b[0])),
+                text.interval(common.interval()),
+                text.spread(common.tau),
+                text.spreads(common.tau_interval),
+                _p(common.p_value),
                 str(sum(o.parameter == name for o in p.outliers)),
                 _p(p.batch_p.get(name)),
                 _p(p.drift_p.get(name)),
@@ -161,16 +161,16 @@ def population_tables(p: population.Population) -> dict[str, Table]:
                     name,
                     b.name,
                     str(b.devices),
-                    displayed.value(b.mean),
-                    displayed.interval(b.interval),
-                    displayed.spread(b.differs_by),
+                    text.value(b.mean),
+                    text.interval(b.interval),
+                    text.spread(b.differs_by),
                     _p(b.p_adjusted),
                 )
                 for b in s.batches.batches
             ]
         if s.drift is not None and name in p.drifting:
-            slope = displayed.spread(s.drift.slope)
-            drifts.append((name, slope, displayed.spreads(s.drift.interval), _p(p.drift_p[name])))
+            slope = text.spread(s.drift.slope)
+            drifts.append((name, slope, text.spreads(s.drift.interval), _p(p.drift_p[name])))
     return {
         "outliers": Table(
             ("device", "batch", "date", "parameter", "value", "the others (95 %)", "z",
@@ -223,8 +223,8 @@ def difference_sentence(
     else:
         sentence = f"None of the {len(rows)} parameters differs beyond noise."
     if len({f.verdict for f in findings if f.verdict}) > 1:
-        items = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
-        sentence += f" Verdicts differ ({listing(items)})."
+        named = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
+        sentence += f" Verdicts differ ({listing(named)})."
     return " ".join((sentence, *missed_sentences(findings)))
 
 
@@ -243,18 +243,18 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
         ("cause (confidence)", *(causes_text(f) for f in findings)),
     ]
     for output in dict.fromkeys(e.output for f in findings for e in f.errors):
-        items = [next((e for e in f.errors if e.output == output), None) for f in findings]
-        report = [e for e in items if e is not None]
-        item, name = scale, ""
+        errors = [next((e for e in f.errors if e.output == output), None) for f in findings]
+        known = [e for e in errors if e is not None]
+        unit, name = scale, ""
         if output != _LENGTH:
-            item, name = prefixed_scale(max(e.base for e in report), report[0].unit), f"{output}, "
+            unit, name = prefixed_scale(max(e.base for e in known), known[0].unit), f"{output}, "
         for head, part in (
             (f"{name}base, held out", "base"),
             (f"{name}extended, held out", "extended"),
             (f"{name}noise", "noise"),
         ):
-            cells = ("" if e is None else number(item.factor * getattr(e, part)) for e in items)
-            columns.append((in_brackets(head, item.unit), *cells))
+            cells = ("" if e is None else number(unit.factor * getattr(e, part)) for e in errors)
+            columns.append((in_brackets(head, unit.unit), *cells))
     fitted = ("" if f.rms_m is None else number(scale.factor * f.rms_m) for f in findings)
     columns.append((f"fitted, rms [{scale.unit}]", *fitted))
     shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
@@ -267,8 +267,8 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
 
 def causes_text(f: Finding) -> str:
     """Return the named causes with their confidence, rivals joined by "or"."""
-    items = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
-    return listing(items)
+    texts = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
+    return listing(texts)
 
 
 def budget_table(findings: Sequence[Finding]) -> Table:
@@ -286,16 +286,16 @@ def difference_table(findings: Sequence[Finding], rows: Sequence[population.Diff
     """Return the shared parameters with intervals, one device a column, and whether they differ."""
     body = []
     for d in rows:
-        displayed, cells = _ParameterText(d.estimates), []
+        text, cells = _ParameterText(d.estimates), []
         for k, f in enumerate(findings):
-            p = f.parameters.get(displayed.name)
+            p = f.parameters.get(text.name)
             if p is None or k not in d.estimates.places:
                 cells.append("not determined")
                 continue
-            low, high = map(displayed.number, p.interval or (p.value, p.value))
-            cells.append(f"{displayed.number(p.value)} ({low} to {high})")
+            low, high = map(text.number, p.interval or (p.value, p.value))
+            cells.append(f"{text.number(p.value)} ({low} to {high})")
         differ = "yes" if d.differs else "within noise"
-        body.append((displayed.name, displayed.unit, *cells, _p(d.p_adjusted), differ))
+        body.append((text.name, text.unit, *cells, _p(d.p_adjusted), differ))
     head = ("parameter", "unit", *(f.device for f in findings), "p, adjusted", "differ")
     return Table(head, tuple(body))
 

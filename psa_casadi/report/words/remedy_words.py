@@ -153,14 +153,14 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
         where = listing([number(s.at) for s in sizes])
         text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
     else:
-        table = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
+        amounts = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
         still = {s.output for s in sizes if s.value == 0.0} if len(sizes) > 1 else set()
         moves = [
             f"the {plain(o)} by up to {a}"
-            for (test, o), a in table.items()
+            for (test, o), a in amounts.items()
             if test == "record" and o not in still
         ]
-        rms = "".join(f", {a} rms" for (test, _), a in table.items() if test == "rms")
+        rms = "".join(f", {a} rms" for (test, _), a in amounts.items() if test == "rms")
         text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
     return text
 
@@ -200,17 +200,17 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
         ))  # fmt: skip
     stack = d if isinstance(d, StackDiagnosis) else None
     errors, noise = _sizes(d)
-    commands, others = _commands(d, model_file)
+    commands, remarks = _commands(d, model_file)
     if d.verdict == "adequate" and d.doubt:
         text = "Use the model within these records only: their held-out samples cannot confirm it."
-        return Advice((text,), others, commands[:1])
+        return Advice((text,), remarks, commands[:1])
     if d.verdict == "adequate":
         text = (
             f"Use the model: it errs by {errors} on samples that no fit has seen, at a noise of"
             f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
             " are untested."
         )
-        return Advice((text,), others, commands)
+        return Advice((text,), remarks, commands)
     if not d.causes:
         text = (
             f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
@@ -222,13 +222,13 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
                 f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
                 " above the noise."
             )
-            others = (patched, *others)
-        return Advice((text,), others, commands)
+            remarks = (patched, *remarks)
+        return Advice((text,), remarks, commands)
     if d.verdict == "partly_explained" and isinstance(d.budget, StackBudget):
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
-        others = (f"Without an explanation stays {left} rms above the noise.", *others)
+        remarks = (f"Without an explanation stays {left} rms above the noise.", *remarks)
     lines = tuple(_of_cause(c, lambda v: scale_of(d.experiments, v)) for c in d.causes[:_CAUSES])
-    return Advice(lines, (*_rivals(d.causes), *others), commands)
+    return Advice(lines, (*_rivals(d.causes), *remarks), commands)
 
 
 def _sizes(d: Diagnosis) -> tuple[str, str]:
@@ -276,16 +276,16 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
         commands.append(
             f"psa design experiment {model} --record RECORD.csv --separate {names} -o NEXT.csv"
         )
-    items = []
+    remarks = []
     if outside:
         names = listing([plain(c.effect) for c in outside])
-        items.append(f"An exported plant leaves out {names}: correct the reading instead.")
+        remarks.append(f"An exported plant leaves out {names}: correct the reading instead.")
     if model_file is None:
-        items.append(
+        remarks.append(
             f"The commands read {file}: write it with -o {file}, in Python with"
             f' psa.save_model(result.model, "{file}").'
         )
-    return tuple(commands), tuple(items)
+    return tuple(commands), tuple(remarks)
 
 
 def _of_cause(cause: Cause, length: Length) -> str:
@@ -302,8 +302,8 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
         known = [EFFECTS[n] for n in cause.cannot_be_told_from[:_RIVALS] if n in EFFECTS]
         each = [f"{plain(e.name)}: {lowered(DO[e.what_now.code])}" for e in known]
         if each:
-            item = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
-            tests = dict.fromkeys(e.what_now.test for e in (*item, *known))
+            cause_effect = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
+            tests = dict.fromkeys(e.what_now.test for e in (*cause_effect, *known))
             text = listing([RECORDS[t] for t in tests])
             lines.append(
                 f"The record does not decide; in the place of {plain(cause.effect)} it may be"

@@ -126,7 +126,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     stack = d if isinstance(d, StackDiagnosis) else None
     count = 1 if stack else len(d.experiments[0].channels)
     noise = {e.output: e.noise for e in d.errors}
-    items = []
+    rows = []
     for j in range(count):
         base, extended = d.shown(j)
         for k, e in enumerate(d.experiments):
@@ -135,10 +135,10 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
                 curves.append(Curve("extended model", colours.EXTENDED, extended[k]))
             if stack:
                 level = stack.noise[k].level if stack.noise else stack.noise_floor_rms_m
-                items.append(_displacement(k, e, curves, level))
+                rows.append(_displacement(k, e, curves, level))
             else:
-                items += _output(d.model, d.experiments, (k, j), noise, curves)
-    return tuple(items)
+                rows += _output(d.model, d.experiments, (k, j), noise, curves)
+    return tuple(rows)
 
 
 def series_of_fit(identification: Identification) -> tuple[Series, ...]:
@@ -257,8 +257,8 @@ def telling_window(s: Series) -> slice:
                 continue
             y = first.values[part]
             errors = [float(np.sqrt(np.mean(m[part] ** 2))) for m in miss]
-            observed = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
-            score = observed / (float(np.ptp(y)) + 6.0 * s.noise + observed) * width**0.25
+            fall = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
+            score = fall / (float(np.ptp(y)) + 6.0 * s.noise + fall) * width**0.25
             if score > best:
                 best, window = score, part
     return window

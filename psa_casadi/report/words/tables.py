@@ -156,8 +156,8 @@ def error_table(d: Diagnosis, scale: Scale) -> Table:
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
         lengths = (e.train_rms_m, e.holdout_rms_m, e.holdout_max_m)
-        displayed = (number(factor * v) for v in lengths)
-        lines.append((name, *displayed, number(e.holdout_nrmse_percent)))
+        figures = (number(factor * v) for v in lengths)
+        lines.append((name, *figures, number(e.holdout_nrmse_percent)))
     noise = number(factor * d.noise_floor_rms_m)
     lines.append(("noise", noise, noise, "", ""))
     head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
@@ -184,9 +184,9 @@ def _falls(
     rows = []
     for name, unit, noise, base, after in inputs:
         scale = prefixed_scale(base, unit)
-        items = [noise, base, *([after] if extended else [])]
+        figures = [noise, base, *([after] if extended else [])]
         falls = [f"{100.0 * (1.0 - after / base):.0f} %"] if extended and base > 0 else []
-        rows.append((name, scale.unit, *(number(scale.factor * v) for v in items), *falls))
+        rows.append((name, scale.unit, *(number(scale.factor * v) for v in figures), *falls))
     return _table((*head, *(("extended, held-out rms", "falls by") if extended else ())), rows)
 
 
@@ -195,8 +195,8 @@ def column_table(d: StackDiagnosis) -> Table:
     rows = []
     for c in d.columns:
         errors = (c.noise, c.base_rms, c.extended_rms if added(d) else None)
-        displayed = ("" if e is None else number(e) for e in errors)
-        rows.append((c.column, c.role, c.unit, *displayed))
+        figures = ("" if e is None else number(e) for e in errors)
+        rows.append((c.column, c.role, c.unit, *figures))
     head = ("noise rms", "base, held-out rms", "extended, held-out rms")
     return _table(("column", "used as", "unit", *head), rows)
 
@@ -213,13 +213,13 @@ def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]
     lines = []
     for s, f in zip(series, figures, strict=True):
         scale = scales[s.quantity]
-        displayed = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
+        sizes = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
         ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
-        output = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
-        lines.append((s.name, *(() if one else (scale.unit,)), *displayed, *output))
+        others = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
+        lines.append((s.name, *(() if one else (scale.unit,)), *sizes, *others))
     lengths = [in_brackets(what, one) for what in ("rms", "largest", "noise")]
-    output = ("rms / noise", "rms [% of range]", "correlation of neighbours")
-    return _table(("record", *(() if one else ("unit",)), *lengths, *output), lines)
+    others = ("rms / noise", "rms [% of range]", "correlation of neighbours")
+    return _table(("record", *(() if one else ("unit",)), *lengths, *others), lines)
 
 
 def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
@@ -235,9 +235,9 @@ def record_table(experiments: "Sequence[Experiment]", origin: str) -> Table:
     """Return the records with their size, how they were used, and their SHA-256."""
     rows = []
     for e in experiments:
-        inputs = e.record
+        record = e.record
         counts = (str(int(part.sum())) for part in (e.used, e.held_out))
-        rows.append((inputs.name, origin, number(inputs.duration), *counts, inputs.sha256))
+        rows.append((record.name, origin, number(record.duration), *counts, record.sha256))
     return _table(
         ("record", "origin", "duration [s]", "samples fitted", "samples held out", "SHA-256"), rows
     )
@@ -262,8 +262,8 @@ def blind_table(d: StackDiagnosis) -> Table:
     rows = []
     for b in blindest(d):
         # a screening without any direction for the effect reports the largest number there is
-        observed = b.smallest_detectable_gain < 1e100
-        size = with_unit(number(b.smallest_detectable_gain), b.unit) if observed else "at no size"
+        detectable = b.smallest_detectable_gain < 1e100
+        size = with_unit(number(b.smallest_detectable_gain), b.unit) if detectable else "at no size"
         rows.append((plain(b.effect), size, b.why))
     return _table(("effect", "shows from", "why"), rows)
 
@@ -311,9 +311,9 @@ def check_table(report: "CheckReport") -> Table:
     for r in report.rows:
         # where none is allowed it counts problems
         counted = r.limit == 0 and r.figure >= 0
-        matches = str(int(r.figure)) if counted else number(r.figure)
+        figure = str(int(r.figure)) if counted else number(r.figure)
         result = "note" if r.noted else "pass" if r.passed else "FAIL"
-        rows.append((r.name, matches, number(r.limit), result, r.remark, r.clause))
+        rows.append((r.name, figure, number(r.limit), result, r.remark, r.clause))
     head = ("check", "found", "allowed", "result", "remark", "clause")
     if report.foreign:
         return _table((*head[:1], *head[3:]), [(row[0], *row[3:]) for row in rows])

@@ -142,29 +142,23 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
 
 
 def identification_text(
-    stack_identification: StackIdentification, *, origin: str = "measured", width: int = 100
+    identification: StackIdentification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
-    scale = scale_of(stack_identification.experiments, stack_identification.fit.rms)
-    span = max(e.record.range_m for e in stack_identification.experiments)
-    share = number(100.0 * stack_identification.fit.rms / span, 2)
+    scale = scale_of(identification.experiments, identification.fit.rms)
+    span = max(e.record.range_m for e in identification.experiments)
+    share = number(100.0 * identification.fit.rms / span, 2)
     head = [
-        ("records", _records_text(stack_identification.experiments, origin)),
-        (
-            "error",
-            f"{scale.text(stack_identification.fit.rms)} rms, {share} % of the largest range",
-        ),
+        ("records", _records_text(identification.experiments, origin)),
+        ("error", f"{scale.text(identification.fit.rms)} rms, {share} % of the largest range"),
     ]
-    tail = [("warning", w) for w in stack_identification.warnings]
-    tail += [("open", c.sentence) for c in stack_identification.combinations]
-    tail += [("next", a.sentence) for a in stack_identification.advice]
+    tail = [("warning", w) for w in identification.warnings]
+    tail += [("open", c.sentence) for c in identification.combinations]
+    tail += [("next", a.sentence) for a in identification.advice]
     tail += [
-        ("note", n)
-        for n in (*stack_identification.sentences, *stack_identification.model.provenance.notes)
+        ("note", n) for n in (*identification.sentences, *identification.model.provenance.notes)
     ]
-    return _around(
-        head, parameter_table(stack_identification.model, stack_identification), tail, width
-    )
+    return _around(head, parameter_table(identification.model, identification), tail, width)
 
 
 def fit_sentence(identification: Identification) -> str:
@@ -179,11 +173,11 @@ def fit_sentence(identification: Identification) -> str:
 
 
 def effect_page(
-    effect: Component, width: int = 100, observed: tuple[Model, Sequence[Size]] | None = None
+    effect: Component, width: int = 100, example: tuple[Model, Sequence[Size]] | None = None
 ) -> str:
     """Return one effect: what it is, equation, signature, source, what now, parameters.
 
-    `observed` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
+    `example` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
     """
     lines = [
         ("what", effect.description),
@@ -192,7 +186,7 @@ def effect_page(
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
-    lines += [("how large", effect_size(effect, *observed))] if observed is not None else []
+    lines += [("how large", effect_size(effect, *example))] if example is not None else []
     lines += zip(("what now", "record"), effect_advice(effect), strict=True)
     return f"{effect.name}\n\n{_around(lines, effect_parameter_table(effect), (), width)}"
 
@@ -215,12 +209,12 @@ def check_sentence(report: "CheckReport") -> str:
 
 def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
     """Return the records with their samples, duration and what they are."""
-    parts, out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
-    for name, item in in_parts(e.record for e in experiments):
-        held, lasts = sum(out[id(r)] for r in item), sum(r.duration for r in item)
+    parts, held_out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
+    for name, records in in_parts(e.record for e in experiments):
+        held, lasts = sum(held_out[id(r)] for r in records), sum(r.duration for r in records)
         rest = f", {held} of them held out" if held else ""
-        cut = f"{len(item)} parts, " * (len(item) > 1)
-        size = f"{cut}{sum(r.n for r in item)} samples in {number(lasts)} s{rest}"
+        cut = f"{len(records)} parts, " * (len(records) > 1)
+        size = f"{cut}{sum(r.n for r in records)} samples in {number(lasts)} s{rest}"
         parts.append(f"{name} ({origin}: {size})")
     return "; ".join(parts)
 

@@ -39,10 +39,10 @@ def gain_sentence(d: StackDiagnosis) -> str:
     low, high = d.gain.interval
     if gain <= 0:
         return "the held-out error does not fall"
-    output = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
-    if output[1] == "100":
-        output = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
-    return f"the held-out error falls by {output[0]} % (95 % interval {output[1]} to {output[2]} %)"
+    fall, least, most = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
+    if least == "100":
+        fall, least, most = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
+    return f"the held-out error falls by {fall} % (95 % interval {least} to {most} %)"
 
 
 def verdict_sentence(d: Diagnosis) -> str:
@@ -54,13 +54,13 @@ def verdict_sentence(d: Diagnosis) -> str:
     elif d.verdict == "adequate":
         text = f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}"
     elif d.verdict == "not_driven":
-        observed = (
+        reason = (
             "The displacement falls while the voltage rises: correct the sign of one of them."
             " Nothing was diagnosed"
             if doubtful_sign([e.record for e in d.experiments])
             else "The displacement does not follow the voltage: nothing can be diagnosed"
         )
-        text = f"{observed}; {_base_errors(d)}"
+        text = f"{reason}; {_base_errors(d)}"
     elif d.verdict == "unexplained" or not d.causes:
         nothing = "Something is missing, and no effect in the table explains it: no cause is named"
         text = f"{nothing}; {_without_name(d)}{_base_errors(d)}"
@@ -299,8 +299,8 @@ def budget_table(d: Diagnosis) -> Table:
     if isinstance(b, StackBudget):
         scale = phrases.scale_of(d.experiments, b.excess_rms_m)
         share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-        displayed = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
-        left = (_REMAINS, f"{displayed}, {scale.text(b.remains_rms_m)}", "")
+        rest = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
+        left = (_REMAINS, f"{rest}, {scale.text(b.remains_rms_m)}", "")
     return Table(("what", "removes", "95 % interval"), (*rows, left))
 
 
