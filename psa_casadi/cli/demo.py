@@ -9,8 +9,7 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Inputs
-from psa_casadi.cli.screen import show, show_table, width, working
-from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
+from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, show, show_table, width, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write, make_folder
 

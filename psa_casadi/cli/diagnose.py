@@ -14,8 +14,15 @@ from psa_casadi.cli.failures import judge
 from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
-from psa_casadi.cli.screen import show, show_table, show_written, width, working
-from psa_casadi.cli.steps import DIAGNOSE, events_to
+from psa_casadi.cli.screen import (
+    DIAGNOSE,
+    events_to,
+    show,
+    show_table,
+    show_written,
+    width,
+    working,
+)
 
 
 def diagnose(

@@ -10,8 +10,7 @@ from psa_casadi.cli.failures import kept
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import print_message, show, show_written, width, working
-from psa_casadi.cli.steps import IDENTIFY
+from psa_casadi.cli.screen import IDENTIFY, print_message, show, show_written, width, working
 from psa_casadi.files import atomic_write
 
 if TYPE_CHECKING:

@@ -9,17 +9,9 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
+from psa_casadi.cli import screen
 from psa_casadi.cli.inputs import Inputs, similar
 from psa_casadi.cli.options import names
-from psa_casadi.cli.screen import (
-    set_quiet,
-    show,
-    show_always,
-    show_table,
-    show_written,
-    width,
-    working,
-)
 from psa_casadi.errors import InputError
 from psa_casadi.files import make_folder
 
@@ -65,19 +57,19 @@ def effects(
     wanted = _known_name(inputs, name, "effect", known, f"there are {', '.join(known)}.")
     inputs.check()
     if name is None and quiet:
-        show_always("\n".join(listed))
+        screen.show_always("\n".join(listed))
     elif name is None:
-        show_table(effects_table(listed.values()))
+        screen.show_table(effects_table(listed.values()))
     else:
         if figure is not None:
             save_signature(known[wanted], signature(known[wanted]), figure)
         if quiet:
-            show_always(wanted)
+            screen.show_always(wanted)
         else:
             with suppress(psa.MachineError):  # no compiler to simulate it
                 size = example(known[wanted], stack)
-            show(effect_page(known[wanted], width(), size))
-        show_written(figure)
+            screen.show(effect_page(known[wanted], screen.width(), size))
+        screen.show_written(figure)
 
 
 def _known_name(
@@ -108,15 +100,15 @@ def stacks(
     """
     from psa_casadi.report.words.tables import stack_table, stacks_table
 
-    set_quiet(quiet)
+    screen.set_quiet(quiet)
     description = psa.stack_model(name).description if name is not None else ""
     if quiet:
-        show_always(name or "\n".join(psa.STACKS))
+        screen.show_always(name or "\n".join(psa.STACKS))
     elif name is None:
-        show_table(stacks_table(psa.STACKS.values()))
+        screen.show_table(stacks_table(psa.STACKS.values()))
     else:
-        show(textwrap.fill(f"{name}: {description}", width()) + "\n")
-        show_table(stack_table(psa.STACKS[name]))
+        screen.show(textwrap.fill(f"{name}: {description}", screen.width()) + "\n")
+        screen.show_table(stack_table(psa.STACKS[name]))
 
 
 def datasets(
@@ -141,21 +133,21 @@ def datasets(
     from psa_casadi.datasets import DATASETS, copy, find, origin_text
     from psa_casadi.report.words.tables import Table
 
-    set_quiet(quiet)
+    screen.set_quiet(quiet)
     if name is None and output is not None:
         raise InputError("--output needs the name of a dataset; `psa datasets` lists them.")
     if name is None and quiet:
-        show_always("\n".join(DATASETS))
+        screen.show_always("\n".join(DATASETS))
     elif name is None:
         each = DATASETS.values()
         rows = tuple((d.name, str(len(d.files)), d.licence, d.description) for d in each)
-        show_table(Table(("dataset", "records", "licence", "holds"), rows))
+        screen.show_table(Table(("dataset", "records", "licence", "holds"), rows))
     elif output is None:
-        show_always(find(name).name if quiet else origin_text(find(name)))
+        screen.show_always(find(name).name if quiet else origin_text(find(name)))
     else:
-        with working(f"fetching {name}"):
+        with screen.working(f"fetching {name}"):
             written = copy(name, output)
-        show_written(*written)
+        screen.show_written(*written)
 
 
 def examples(
@@ -186,16 +178,16 @@ def examples(
     wanted = _known_name(inputs, name, "example or recipe", known, "`psa examples` lists them.")
     inputs.check()
     if name is None and quiet:
-        show_always("\n".join(known))
+        screen.show_always("\n".join(known))
     elif name is None:
         rows = tuple((e.name, e.kind, e.title) for e in known.values())
-        show_table(Table(("name", "kind", "what it shows"), rows))
-        show(
+        screen.show_table(Table(("name", "kind", "what it shows"), rows))
+        screen.show(
             "\npsa examples NAME shows one; psa examples NAME -o FOLDER copies it and runs an"
             " example"
         )
     elif output is None:
-        show_always(known[wanted].text.rstrip("\n"))
+        screen.show_always(known[wanted].text.rstrip("\n"))
     else:
         chosen = known[wanted]
         make_folder(output)
@@ -203,12 +195,12 @@ def examples(
         written = index.copy_example(chosen, output)
         result: object = None
         if chosen.kind == "example" and not copy_only:
-            with working(f"running {chosen.name}"):
+            with screen.working(f"running {chosen.name}"):
                 result = index.run_example(chosen.name, output)
         if isinstance(result, Mapping):  # named figures, one in each line
             texts = ((k, f"{v:.4g}" if isinstance(v, float) else v) for k, v in result.items())
             result = "\n".join(f"{k}: {v}" for k, v in texts)
         if isinstance(result, str):
-            show(result)
+            screen.show(result)
         new = sorted(p for p in output.iterdir() if p.name not in before and p not in written)
-        show_written(*written, *new)
+        screen.show_written(*written, *new)

@@ -20,7 +20,7 @@ from psa_casadi.files import temporary_folder
 
 if TYPE_CHECKING:
     import psa_casadi as psa
-    from psa_casadi.workbench.subject import Subject
+    from psa_casadi.workbench.previews import Subject
 
 
 def web(
@@ -84,7 +84,7 @@ def web(
 
 def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
     """Return what the page diagnoses: a stack, or a model of one's own."""
-    from psa_casadi.workbench.subject import Subject
+    from psa_casadi.workbench.previews import Subject
 
     if model is None:
         return Subject()

@@ -13,9 +13,8 @@ from psa_casadi.characters import plain, visible
 from psa_casadi.errors import InputError
 from psa_casadi.records.read.file_bytes import MOST_BYTES
 from psa_casadi.workbench import run as runs
-from psa_casadi.workbench.previews import preview
+from psa_casadi.workbench.previews import Subject, preview
 from psa_casadi.workbench.run import Run, Settings, removed
-from psa_casadi.workbench.subject import Subject
 
 #: The longest name, in letters.
 _LONGEST = 80

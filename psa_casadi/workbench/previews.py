@@ -11,6 +11,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,37 @@ from psa_casadi.errors import InputError, MachineError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.reading import read_records, read_signals
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import COLUMNS, Record
 from psa_casadi.records.signals import Signals
-from psa_casadi.workbench.subject import Subject
+from psa_casadi.units import parse_unit, units_of
 
 #: Time [s] that a file may take.
 _LIMIT_S = 120.0
 _MODULE = "psa_casadi.workbench.previews"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The model whose records are diagnosed; without inputs and outputs it is a stack's.
+
+    `units` are those of its inputs and outputs. `arguments` name it to the command `psa diagnose`,
+    `files` are those beside which the command runs.
+    """
+
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    @property
+    def columns(self) -> dict[str, list[str]]:
+        """The columns of its records, each with the units that it may have, the model's first."""
+        if not self.units:
+            return {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()}
+        units = {n: units_of(parse_unit(u).quantity) for n, u in self.units.items()}
+        columns = {n: list(dict.fromkeys([u, *units[n]])) for n, u in self.units.items()}
+        return {"time": list(units_of("time")), **columns}
 
 
 def preview(

@@ -21,7 +21,7 @@ from psa_casadi.errors import InputError, MachineError
 from psa_casadi.report.page.document import environment, script_hash, source
 from psa_casadi.version import __version__
 from psa_casadi.workbench.desk import BusyError, Desk
-from psa_casadi.workbench.subject import Subject
+from psa_casadi.workbench.previews import Subject
 
 #: The name of the machine for itself, as addresses have it.
 HOST = "127.0.0.1"

@@ -18,10 +18,9 @@ from typer.testing import CliRunner
 import psa_casadi
 import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
-from psa_casadi.cli import steps
+from psa_casadi.cli import screen
 from psa_casadi.cli.app import app
-from psa_casadi.cli.screen import show_table, working
-from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, ProgressLine
+from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, Course, ProgressLine, show_table, working
 from psa_casadi.datasets import DATASETS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
@@ -167,7 +166,7 @@ def test_the_checks_of_an_fmu_are_tests() -> None:
     }
 
 
-SOURCE = Path(steps.__file__).parents[1]
+SOURCE = Path(screen.__file__).parents[1]
 
 
 class Clock:
@@ -182,7 +181,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     result = Clock()
-    monkeypatch.setattr(steps, "clock", result)
+    monkeypatch.setattr(screen, "clock", result)
     return result
 
 

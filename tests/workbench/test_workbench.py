@@ -19,9 +19,9 @@ from psa_casadi.cli import web
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk, Limits, stored_name
+from psa_casadi.workbench.previews import Subject
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
-from psa_casadi.workbench.subject import Subject
 from tests.contract.test_commands import asked
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs

@@ -24,26 +24,14 @@ from psa_casadi.population.finding import (
     NamedCause,
     replayed,
 )
-from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
-from psa_casadi.report.documents.files import (
-    DIAGNOSES,
-    AnyDiagnosisFile,
-    DeviceFile,
-    DiagnosisFile,
-    IdentificationFile,
-    OwnModelFile,
-    damage,
-    diagnosis_in,
-    identification_file,
-)
-from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
+from psa_casadi.report.documents import files
 from psa_casadi.strict_json import decode, read_json
 
 #: The file in a device's folder that says how its work ended.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 #: What `identify`, `diagnose` and `load_diagnosis` return.
-Result = Diagnosis | Identification | AnyDiagnosisFile
+Result = Diagnosis | Identification | files.AnyDiagnosisFile
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
 #: Names of files that say what is in them, not of which device.
@@ -81,13 +69,13 @@ def read_findings(
 
 def device_finding(
     folder: Path,
-    device_file: DeviceFile,
+    device_file: files.DeviceFile,
     effects: Sequence[Component] = (),
     *,
     traces: bool = False,
 ) -> Finding:
     """Return the finding in a device's folder of `psa batch`; damage is an InputError."""
-    damaged = damage(folder, device_file)
+    damaged = files.damage(folder, device_file)
     if damaged:
         raise InputError(damaged)
     (joined,) = _joined(
@@ -101,41 +89,41 @@ def _read(
     result: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
-    if isinstance(result, AnyDiagnosisFile):
+    if isinstance(result, files.AnyDiagnosisFile):
         return [(Path(result.records[0].name), _diagnosis(result))]
     if isinstance(result, Identification):
         path, source = Path(result.experiments[0].record.name), "identification"
-        content = identification_file(result)
+        content = files.identification_file(result)
     elif isinstance(result, Diagnosis):
         path = Path(result.experiments[0].record.name)
         content = result.to_dict()
-        finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
+        finding = _diagnosis(decode(files.DIAGNOSES[content["format"]], content, "diagnosis"))
         return [(path, _with_model(finding, _model(result.model, traces)))]
     else:
         path = Path(result) / DEVICE_FILE if Path(result).is_dir() else Path(result)
         source = str(path)
         content = read_json(path, _ADVICE)
-    diagnosis, kind = diagnosis_in(content, source)
+    diagnosis, kind = files.diagnosis_in(content, source)
     if diagnosis is not None:
         return [(path, _diagnosis(diagnosis))]
-    if kind == DEVICE:
-        device_file = decode(DeviceFile, content, source)
+    if kind == files.DEVICE_FORMAT:
+        device_file = decode(files.DeviceFile, content, source)
         if device_file.status != "done":
             why = " ".join(device_file.problems)
             raise InputError(f"{path}: the work on this device was {device_file.status}: {why}")
         return [(path, device_finding(path.parent, device_file, effects, traces=traces))]
-    if kind == IDENTIFICATION:
-        return [(path, _identification(decode(IdentificationFile, content, source)))]
+    if kind == files.IDENTIFICATION_FORMAT:
+        return [(path, _identification(decode(files.IdentificationFile, content, source)))]
     if kind == MODEL:
         return [(path, _model(model_of(content, source, effects), traces))]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 
-def _diagnosis(d: AnyDiagnosisFile) -> Finding:
+def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
     errors = []
-    if isinstance(d, DiagnosisFile):
+    if isinstance(d, files.DiagnosisFile):
         base, extended = d.base_errors, d.extended_errors
         errors = [
             HeldOutErrors(
@@ -146,7 +134,7 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
                 extended.holdout_nrmse_percent,
             )
         ]
-    elif isinstance(d, OwnModelFile):
+    elif isinstance(d, files.OwnModelFile):
         errors = [
             HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
             for e in d.errors
@@ -170,7 +158,7 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
     )
 
 
-def _identification(i: IdentificationFile) -> Finding:
+def _identification(i: files.IdentificationFile) -> Finding:
     return Finding(
         device="",
         kind="identification",

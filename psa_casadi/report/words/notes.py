@@ -9,8 +9,7 @@ from psa_casadi.errors import quoted
 from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
-from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
-from psa_casadi.report.words.noise_words import NOISE
+from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT, NOISE
 from psa_casadi.report.words.phrases import (
     are,
     listing,
