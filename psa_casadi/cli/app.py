@@ -59,7 +59,7 @@ def _main(
 
 
 def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
-    """Add commands; the first sentence stands whole in the list, the example on one line."""
+    """Add commands; the list shows the whole first sentence, the help the example on one line."""
     for function in functions:
         about, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
         kinds = [p.annotation for p in inspect.signature(function).parameters.values()]

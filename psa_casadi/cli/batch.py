@@ -13,7 +13,7 @@ from psa_casadi.cli.options import Hysteresis, Reading
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_results, show_written, working
 
-#: Devices without a result that are told one by one.
+#: Devices without a result that are listed one by one.
 _MOST_TOLD = 10
 
 
@@ -77,7 +77,7 @@ def batch(
             jobs or (), output, options=options, executor=client, workers=workers,
             progress=progress,
         )  # fmt: skip
-        with suppress(psa.InputError):  # too few devices tell a parameter
+        with suppress(psa.InputError):  # too few devices determine a parameter
             whole = population(done.findings) if report is not None else None
     rows = [(d, (d.device, d.status, " ".join(d.problems))) for d in done.devices]
     if report is not None and whole is not None:
@@ -126,13 +126,13 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), inputs: I
     inputs.check()
     with working("comparing"):
         if len(files) == 1 and files[0].is_dir():
-            findings, lost = read_results(files[0], inputs.own)
+            findings, lost = read_results(files[0], inputs.user_effects)
             show_lost(lost, output)
             whole = population(findings)
             psa.write_population(whole, output, without=lost)
             texts = population_sentences(whole)
         else:
-            compared = psa.compare(*files, effects=inputs.own)
+            compared = psa.compare(*files, effects=inputs.user_effects)
             compared.report(output)
             texts, tables = (compared.sentence,), compared.tables
     show_results(texts, tables)

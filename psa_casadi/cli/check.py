@@ -69,7 +69,7 @@ def check(
     inputs.check()
     with working("checking"):
         report = psa.check_fmu(
-            fmu, chosen, effects=inputs.own, timeout=timeout, memory=memory << 20,
+            fmu, chosen, effects=inputs.user_effects, timeout=timeout, memory=memory << 20,
             evidence=evidence, records=records, portable=portable, foreign=foreign or None,
         )  # fmt: skip
     show_table(check_table(report))

@@ -24,7 +24,7 @@ FILES = {
     "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
 }
 _ORIGIN = "synthetic"
-#: What its plant has, which no step of the demonstration is told.
+#: The effect of its plant, which no step of the demonstration knows.
 HIDDEN = (
     "Hidden in the record: slow creep by 2.0 % of the elongation for each decade of time, from"
     " 0.08 s on, without end."

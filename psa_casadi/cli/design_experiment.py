@@ -1,4 +1,4 @@
-"""`psa design experiment`: the next record to measure, for parameters or to tell effects apart."""
+"""`psa design experiment`: the next record to measure, for parameters or to separate effects."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.errors import InputError
 
-#: Samples of a record where no number is given.
+#: Samples of a record by default.
 _SAMPLES = 1000
 
 
@@ -100,7 +100,7 @@ def experiment(
     if chosen is not None:
         inputs.refuse({"--stack": stack, "--low": low, "--high": high, "--current": current})
         records: Sequence[psa.Signals] = inputs.signals(chosen, record or [], reading)
-        table = {c.name: c for c in inputs.of_any_model()}
+        table = {c.name: c for c in inputs.effects_of_any_model()}
         effects = [table.get(n, n) for n in effects]
     else:
         records = inputs.records(record, reading) if record else []
@@ -139,7 +139,7 @@ def _stacks_effects(inputs: Inputs, wanted: Sequence[str]) -> "list[psa.Componen
     """Return the effects of a stack to separate; all mistakes are noted."""
     from psa_casadi.model.own_effects import known_effects
 
-    table = known_effects(inputs.own)
+    table = known_effects(inputs.user_effects)
     for name in [n for n in wanted if n not in table]:
         inputs.add(f"There is no effect '{name}'; `psa effects` lists them.")
     return [table[n] for n in wanted if n in table]
@@ -151,7 +151,7 @@ def _limits(
     inputs: Sequence[str],
     wanted: Mapping[str, float | None],
 ) -> "dict[str, psa.design.Limits]":
-    """Return the limits: as given, else those of a stack's records, else its rated voltage."""
+    """Return the limits: by the options, else of a stack's records, else its rated voltage."""
     from psa_casadi.design.experiment.limits import Limits, limits_of
     from psa_casadi.simulation.start import is_stack
 
@@ -187,7 +187,7 @@ def _limits(
 
 
 def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] | float | None:
-    """Return the noise of every output as given: that of a stack in nm, else in its unit."""
+    """Return the noise of every output by the option: of a stack in nm, else in its unit."""
     values: dict[str, float] = {}
     for text in texts:
         name, _, figure = text.rpartition("=")

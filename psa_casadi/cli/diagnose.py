@@ -155,7 +155,7 @@ def _of_stack(
     inputs: Inputs,
     left_out: Sequence[str],
 ) -> Callable[..., psa.Diagnosis]:
-    """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
+    """Read the records of a stack; return a function of `progress` and `watch` that diagnoses them.
 
     `paths` are those to diagnose, to hold out and of the healthy device; `device` are --stack,
     --stiffness and --hysteresis.
@@ -184,7 +184,7 @@ def _finish(
 ) -> tuple[psa.Diagnosis, str]:
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
-    `page` says what the page calls the records, and whether it is still.
+    `page` is the origin of the records, and whether the page is still.
     """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
@@ -204,7 +204,7 @@ def _finish(
 
 
 def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None:
-    """Demand that no model written beside the output is the one that is read."""
+    """Demand that no model written next to the output is the one that is read."""
     if output is None or model is None or model.resolve().parent != output.resolve().parent:
         return
     if fnmatch(model.name, f"{output.stem}_*_for_*.json"):
@@ -215,7 +215,7 @@ def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, 
     """Return the effects to search, without those that --leave-out names."""
     from psa_casadi.model.own_effects import known_effects
 
-    known = known_effects(inputs.own)
+    known = known_effects(inputs.user_effects)
     for name in dict.fromkeys(n for n in left_out if n not in known):
         inputs.add(
             f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects` lists"

@@ -21,7 +21,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_se
 
 
 def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
-    """Return the models with another cause, each with its file beside the extended model's."""
+    """Return the models with another cause, each with its file next to the extended model's."""
     if output is None or not isinstance(d, result.StackDiagnosis):
         return []
     return [
@@ -39,11 +39,9 @@ def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
 
 
 def models(d: result.Diagnosis, output: Path | None) -> list[str]:
-    """Say what the model's file holds if nothing was added, and which files are beside it."""
-    lines = [
-        f"written: {path}, with {a.instead} instead of {a.cause}"
-        for a, path in alternatives(d, output)
-    ]
+    """Say what the model's file holds if nothing was added, and which files are next to it."""
+    others = alternatives(d, output)
+    lines = [f"written: {path}, with {a.instead} instead of {a.cause}" for a, path in others]
     if output is not None and not added(d):
         lines.append(f"nothing was added: {output} holds the base model")
     return lines
@@ -76,7 +74,7 @@ def write(
     *,
     still: bool = False,
 ) -> None:
-    """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
+    """Write the wanted files, each whole or not at all, and add them to the `written` ones."""
     extended = None if outputs["--output"] is None else str(outputs["--output"])
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
@@ -111,7 +109,7 @@ def with_next(
         reasons = (*before.reasons, f"No record could be designed: {error}")
         return replace(d, next_experiment=replace(before, reasons=reasons))
     each = sentences(design)
-    if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
+    if design.plays is None:  # it would not decide; the last sentence is what an amplifier needs
         reasons = (*before.reasons, *each[:-1], *same)
         return replace(d, next_experiment=replace(before, reasons=reasons))
     write_record(path, experiment.columns_to_play(design))

@@ -17,7 +17,7 @@ from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.files import atomic_write, make_folder
 
-#: The stack of a system for which no model is given.
+#: The stack of a system without a model.
 DEFAULT_STACK = "P-885.51"
 
 

@@ -128,7 +128,7 @@ def prepare() -> None:
     """Give a command streams that can be written to, and an end that leaves nothing behind.
 
     All temporary files, those of other packages and programs too, lie in a folder of ours. Where
-    none can be made, the first to need one says so.
+    none can be made, the first to need one fails.
     """
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:

@@ -125,9 +125,9 @@ def _finish(
     page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "list[Profile]":
-    """Write the files and return the profiles; at an interrupt the model is kept, which it says.
+    """Write the files and return the profiles; an interrupt keeps the model and names it.
 
-    `page` says what the page calls the records, and whether it is still.
+    `page` is the origin of the records, and whether the page is still.
     """
     from psa_casadi.identification.profile import profile
     from psa_casadi.report.documents.files import identification_file
@@ -139,14 +139,11 @@ def _finish(
         if output is not None:
             _save(identification.model, output)
             done.append(output)
-        names = [
-            n
-            for n in wanted
-            if n in identification.determinacy.names and not identification.interrupted
-        ]
+        names = () if identification.interrupted else identification.determinacy.names
         profiles = [
             profile(identification.fit, identification.experiments, n, progress=progress)
-            for n in names
+            for n in wanted
+            if n in names
         ]
         if json is not None:
             atomic_write(json, json_text(identification_file(identification, profiles)))

@@ -27,8 +27,8 @@ _PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".p
 class Inputs:
     """The inputs of a command: collects their problems, to report all of them at once.
 
-    Unless `quiet`, it prints how the reader understood a record's columns. `own` are the effects of
-    the modules that --effects names, `fitted` is the number of records that are not held out.
+    Unless `quiet`, it prints how the reader understood a record's columns. `user_effects` are those
+    of the modules that --effects names, `fitted` is the number of records that are not held out.
     """
 
     effects: list[str] | None = None
@@ -39,20 +39,20 @@ class Inputs:
     def __post_init__(self) -> None:
         """Read the effects."""
         set_quiet(self.quiet)
-        self.own: list[psa.Component] = []
+        self.user_effects: list[psa.Component] = []
         self._misfits: list[str] = []
         if not self.effects:
             return
         from psa_casadi.model.own_effects import declared_effects, misfits
 
         read = [self.attempt(partial(declared_effects, module)) for module in self.effects]
-        self.own = [c for result in read for c in (result or {}).values()]
-        self._misfits = misfits(self.own)
+        self.user_effects = [c for result in read for c in (result or {}).values()]
+        self._misfits = misfits(self.user_effects)
 
-    def of_any_model(self) -> list[psa.Component]:
-        """Return the own effects for a model of one's own: beside a stack they need not fit."""
+    def effects_of_any_model(self) -> list[psa.Component]:
+        """Return the user's effects for a model that is no stack, which they need not fit."""
         self._misfits = []
-        return self.own
+        return self.user_effects
 
     def add(self, sentence: str) -> None:
         """Note one problem."""
@@ -79,7 +79,7 @@ class Inputs:
     def records(
         self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()
     ) -> "list[psa.Record]":
-        """Read records to fit, `fitted` of them, then those held out; none may be given twice.
+        """Read records to fit, `fitted` of them, then those held out; none may come twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. Nothing is
         read where --columns is not understood.
@@ -110,7 +110,7 @@ class Inputs:
     def signals(
         self, model: "psa.Model", paths: Sequence[Path], reading: Reading
     ) -> "tuple[psa.Signals, ...]":
-        """Read records of a model of one's own, each in the units of its file."""
+        """Read records of a model that is no stack, each in the units of its file."""
         if not paths:
             return ()
         read = self.attempt(
@@ -127,7 +127,7 @@ class Inputs:
         return read or ()
 
     def refuse(self, others: Mapping[str, object]) -> None:
-        """Refuse the options that a model of one's own does not take, of those that are given."""
+        """Refuse the options with a value, which a model that is no stack does not take."""
         for option in [name for name, value in others.items() if value]:
             self.add(f"{option} is not there for a model of your own; leave it out.")
 
@@ -143,7 +143,7 @@ class Inputs:
         return values
 
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
-        """Return what --columns says, nothing where it is left out; None where it is wrong.
+        """Return the map of --columns, an empty one without it; None where it is wrong.
 
         A file that it names must be one of the `paths`, where these are known.
         """
@@ -161,7 +161,7 @@ class Inputs:
 
         if path is None:
             return None
-        model = self.attempt(lambda: psa.load_model(path, self.own))
+        model = self.attempt(lambda: psa.load_model(path, self.user_effects))
         if model is None:
             return None
         if not is_stack(model):
@@ -203,11 +203,11 @@ class Inputs:
                 )
             return None
         if any_model:
-            return self.attempt(lambda: psa.load_model(path, self.own))
+            return self.attempt(lambda: psa.load_model(path, self.user_effects))
         return self.model(path)
 
     def turns(self, history: str | None) -> tuple[float, ...]:
-        """Return the voltages [V] of a history; none where it is not given."""
+        """Return the voltages [V] of a history; none without one."""
         try:
             return tuple(float(part) for part in history.split(",")) if history is not None else ()
         except ValueError:
@@ -228,7 +228,7 @@ class Inputs:
         )
 
     def published(self, model: "psa.Model | None", published: Published) -> "psa.Model | None":
-        """Return a model that states what the options say, else what it stated before."""
+        """Return a model with the statements of the options, else its former ones."""
         statements = {name: text for name, text in asdict(published).items() if text is not None}
         for name, text in statements.items():
             if not text.strip() or not text.isprintable():
@@ -238,7 +238,7 @@ class Inputs:
         return replace(model, publication=replace(model.publication, **statements))
 
     def stiffness(self, value: float | None) -> None:
-        """Demand a positive stiffness, if one is given."""
+        """Demand a positive stiffness, if there is one."""
         if value is not None and not 0.0 < value < float("inf"):
             self.add(
                 f"--stiffness is {value:g} N/m; give the positive stiffness of the free stack from"
@@ -288,13 +288,13 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 
 def similar(word: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the question which of the known words is meant, or what is said where none is like."""
+    """Return the question which of the known words is meant, `otherwise` where none is similar."""
     near = difflib.get_close_matches(word, list(known), n=3, cutoff=0.4)
     return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
 def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with its unit; none is guessed.
+    """Return the time [s] of a step, a number with its unit; none is guessed.
 
     Raises InputError for anything else.
     """

@@ -45,7 +45,7 @@ def effects(
     from psa_casadi.report.words.text import effect_page
 
     inputs = Inputs(effects=effects, quiet=quiet)
-    listed = known_effects(inputs.own)
+    listed = known_effects(inputs.user_effects)
     known = {**listed, **{e.name: e for e in MODAL_SERIES.values()}}
     stack, size = inputs.model(model), None
     inputs.outputs({"--figure": figure}, [])

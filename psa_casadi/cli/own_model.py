@@ -19,7 +19,7 @@ _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
 @dataclass(frozen=True, kw_only=True)
 class Fitting:
-    """How a model of one's own is fitted: words of `psa.identify(model, records)`.
+    """How a model that is no stack is fitted: keyword arguments of `psa.identify(model, records)`.
 
     Options:
         fmu: FMU of any tool, in the place of --model.
@@ -43,7 +43,7 @@ class Fitting:
 
     @property
     def words(self) -> dict[str, Any]:
-        """The words that were given, without what says which model it is."""
+        """The keyword arguments that have a value, without those that name the model."""
         every = {n: v for n, v in asdict(self).items() if v and n not in ("fmu", "value")}
         if self.free:
             every["free"] = [text.partition("=")[0] for text in self.free]
@@ -84,8 +84,8 @@ def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Mo
     if path.suffix.lower() == ".fmu" or fitting.fmu:
         return _imported(inputs, path, fitting, fitted)
     try:
-        model = psa.load_model(path, inputs.own)
-    except InputError:  # which is told where a stack's file is read
+        model = psa.load_model(path, inputs.user_effects)
+    except InputError:  # the reader of a stack's file reports it
         return None
     return None if is_stack(model) else model
 
@@ -109,7 +109,7 @@ def _made(file: Path, name: str) -> psa.Model:
     """Return the model that a function of a Python file returns, or that a variable of it is."""
     if not file.is_file():
         raise InputError(f"--model: there is no file {file}; check the name and the directory.")
-    sys.path.append(str(file.resolve().parent))  # what lies beside it can be imported
+    sys.path.append(str(file.resolve().parent))  # modules in its folder can be imported
     try:
         held = runpy.run_path(str(file), run_name=file.stem)
         made = held.get(name)
@@ -139,11 +139,11 @@ def own_diagnosis(
     leave_out: Sequence[str],
     others: Mapping[str, object],
 ) -> Callable[..., psa.Diagnosis]:
-    """Read the records of a model of one's own; return what diagnoses it.
+    """Read the records of a model that is no stack; return a function that diagnoses it.
 
-    That takes `progress` and `watch`; `others` are options that must be empty.
+    It takes `progress` and `watch`; `others` are options that must be empty.
     """
-    components = inputs.of_any_model()
+    components = inputs.effects_of_any_model()
     inputs.refuse(others)
     measured, held = (inputs.signals(model, part, reading) for part in (records, held_out))
     return partial(

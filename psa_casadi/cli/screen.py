@@ -183,7 +183,7 @@ def show(text: str) -> None:
 
 
 def show_always(text: str) -> None:
-    """Print what a command is asked for, also by --quiet."""
+    """Print what a command is for, with --quiet too."""
     typer.echo(visible(text))
 
 

@@ -66,7 +66,7 @@ def simulate(
     values = {} if imported else arguments.numbers("--value", value)
     starts = arguments.numbers("--start", start)
     if chosen is not None:
-        chosen = arguments.attempt(partial(_begun, chosen, values, starts))
+        chosen = arguments.attempt(partial(_changed, chosen, values, starts))
     chosen, record = arguments.ready(chosen), arguments.ready(record)
     with working("simulating"):
         inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
@@ -127,7 +127,7 @@ def _read(
     return (chosen if begin.start_voltage is None else inputs.started(chosen, begin)), record
 
 
-def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
+def _changed(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
     """Return a model with other parameters and starts. Raises InputError."""
     for name in values:
         model.parameter(name)
@@ -135,7 +135,7 @@ def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float
 
 
 def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
-    """Say that the model's start values hold, and which of them --start has given."""
+    """Say that the model's start values hold, and which of them --start has set."""
     from psa_casadi.report.words.phrases import with_unit
 
     every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
@@ -154,7 +154,7 @@ def _of_a_stack(
     starts: dict[str, float],
     hold: str,
 ) -> tuple[dict[str, FloatArray], tuple[str, str]]:
-    """Return the outputs of a stack, and in words where it begins and what it took."""
+    """Return the outputs of a stack, and texts on its start and its steps."""
     as_exported = begin.start_voltage is not None or (begin.history is None and model.starts_itself)
     first, memory = float(record.voltage[0]), None
     if begin.history is not None and not as_exported:
@@ -181,9 +181,9 @@ def _as_displayed(
 def start_sentence(
     model: "psa.Model", record: "psa.Record", history: str | None, values: str
 ) -> str:
-    """Say where a simulation on a record begins, and how an exported FMU begins there too.
+    """Say where a simulation on a record starts, and how an exported FMU starts there too.
 
-    `values` says that it begins at start values, and at which.
+    `values` is the text for start values, if it starts at these.
     """
     from psa_casadi.simulation.start import initial_slope
 

@@ -83,7 +83,7 @@ def web(
 
 
 def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
-    """Return what the page diagnoses: a stack, or a model of one's own."""
+    """Return the subject of the page: a stack, or any other model."""
     from psa_casadi.workbench.previews import Subject
 
     if model is None:
@@ -114,12 +114,12 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Inputs) -> N
     with temporary_folder() as place:
         folder = place / "files"
         folder.mkdir()
-        desk = Desk(folder, list(known_effects(inputs.own)), modules, subject)
+        desk = Desk(folder, list(known_effects(inputs.user_effects)), modules, subject)
         with suppress(KeyboardInterrupt), served(port, desk) as server:
             show_always(f"Open {server.address}")
             print_message("Ctrl-C ends the page and removes its files.")
             sys.stdout.flush()
-            if not no_browser:  # by a file that leads there: other users see what it is told
+            if not no_browser:  # by a file that leads there: other users see its command line
                 way, address = place / "open.html", escape(server.address)
                 way.write_text(
                     f'<!DOCTYPE html><meta http-equiv="refresh" content="0;url={address}">'

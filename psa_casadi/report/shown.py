@@ -1,4 +1,4 @@
-"""What results show of themselves: pictures, pages, a notebook's cell, a line."""
+"""The views of results: pictures, pages, a notebook's cell, a line."""
 
 import base64
 import io
@@ -38,7 +38,7 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     """Write the page of a result, one HTML file below 3 MB that needs no network.
 
     The model of a stack runs in the page unless it is to be `still`. Several findings
-    (`read_findings`) are shown side by side.
+    (`read_findings`) come side by side.
 
     Raises:
         InputError: `path` cannot be written to.

@@ -35,7 +35,7 @@ class Limits:
 def stored_name(name: str, taken: Collection[str]) -> str:
     """Return a name to store a file by: without paths and marks, and unlike those that are taken.
 
-    The ending is kept, as it says how a file is read.
+    The ending is kept, as it decides how a file is read.
     """
     last = re.split(r"[\\/]", plain(name))[-1]
     clean = _BARRED.sub("_", last).strip(" .").lstrip("-").strip(" .") or "record"
@@ -53,7 +53,7 @@ def shown_name(name: str) -> str:
 
 
 def received(stream: BufferedIOBase, size: int, target: Path, admit: Callable[[int], None]) -> None:
-    """Write so many bytes of a stream to a new file; `admit` is asked with how many there are.
+    """Write `size` bytes of a stream to a new file; `admit` gets the count so far, and may refuse.
 
     Raises:
         InputError: the stream ends before, or the file cannot be written.
@@ -106,8 +106,8 @@ class Item:
 class Desk:
     """Files, settings and the run in a folder; any thread may ask. `close` ends what runs.
 
-    What is given lies in a folder of its own, where nothing runs; runs leave theirs beside it.
-    `effects` are the names that may be left out, `modules` those of a user's own effects, `subject`
+    The records lie in a separate folder, where nothing runs; runs leave their files next to it.
+    `effects` are the names that may be left out, `modules` those of a user's effects, `subject`
     is the model that the records are of: a stack's, unless another one is named.
     """
 
@@ -151,7 +151,7 @@ class Desk:
         def arrive(count: int) -> None:
             with self._lock:
                 self._admit(key, name, count)
-                self._arrived[key] = count  # what is promised takes no room from others
+                self._arrived[key] = count  # what is announced takes no room from others
 
         try:
             received(stream, size, coming, arrive)
@@ -170,7 +170,7 @@ class Desk:
         self._look([key])
 
     def _admit(self, key: int, name: str, size: int) -> None:
-        """Refuse a file of so many bytes that finds no room beside what is there and arrives."""
+        """Refuse a file of `size` bytes without room next to what is there and what arrives."""
         with self._lock:
             there = sum(i.size for i in self._items.values())
             there += sum(n for k, n in self._arrived.items() if k != key)
@@ -260,7 +260,7 @@ class Desk:
     # State
 
     def state(self, version: int, number: int, event_count: int) -> dict[str, Any]:
-        """Return what has changed for a tab that knows a version and so many events of a run."""
+        """Return what has changed for a tab that knows a version and a count of events of a run."""
         with self._lock:
             state: dict[str, Any] = {"version": self._version}
             if self._run is not None:

@@ -38,7 +38,7 @@ class Subject:
     """The model whose records are diagnosed; without inputs and outputs it is a stack's.
 
     `units` are those of its inputs and outputs. `arguments` name it to the command `psa diagnose`,
-    `files` are those beside which the command runs.
+    `files` are those next to which the command runs.
     """
 
     inputs: tuple[str, ...] = ()

@@ -23,15 +23,15 @@ _LINES, _LONGEST_LINE = 400, 2000
 _PATIENCE = 20.0
 #: The module that is the command `psa` in a child.
 PSA = "psa_casadi.cli.child"
-#: The folder of the records, beside what a run leaves.
+#: The folder of the records, next to what a run leaves.
 RECORDS = "records"
 #: The files of a diagnosis, and of an export of its model.
 MODEL, JSON, REPORT, EVENTS, FMU = (
     "extended.json", "diagnosis.json", "report.html", "events.jsonl", "extended.fmu",
 )  # fmt: skip
-#: Names that what a diagnosis leaves may have beside these.
+#: Patterns of further files of a diagnosis.
 _MORE = ("extended_*_for_*.json", "diagnosis_next.csv")
-#: Letters of a text: of --columns for all files that may be given.
+#: Letters of a text: enough for --columns of all files.
 _LONGEST = 8000
 _FORMS = ("", "bouc-wen", "spectrum", "best")
 
@@ -40,7 +40,7 @@ _FORMS = ("", "bouc-wen", "spectrum", "best")
 class Settings:
     """What a person chooses for a diagnosis; texts as the options of the command have them.
 
-    `stiffness` is in N/m, `sample_time` in s, each "" where it is not given.
+    `stiffness` is in N/m, `sample_time` in s, each "" by default.
     """
 
     columns: str = ""
@@ -50,7 +50,7 @@ class Settings:
     leave_out: tuple[str, ...] = ()
 
     def changed(self, table: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
-        """Return the settings with what is given; raises InputError for what cannot be."""
+        """Return the settings with these changes; raises InputError for values that cannot be."""
         texts = ("columns", "sample_time", "stiffness", "hysteresis")
         new = {name: str(table[name]).strip()[:_LONGEST] for name in texts if name in table}
         left_out = table.get("leave_out", self.leave_out)
@@ -69,7 +69,7 @@ class Settings:
         return replace(self, **new, leave_out=tuple(e for e in effects if e in left_out))
 
     def without(self, file: str) -> "Settings":
-        """Return the settings without what --columns says of a file that is gone."""
+        """Return the settings without the part of --columns on a file that is gone."""
         kept = (p for p in self.columns.split(",") if not p.strip().startswith(f"{file}@"))
         return replace(self, columns=",".join(kept))
 
@@ -104,7 +104,7 @@ class Run:
         module: str = PSA,
         hidden: Sequence[str] = (),
     ) -> None:
-        """Start it; `hidden` arguments are not part of what a person is shown to type."""
+        """Start it; `hidden` arguments are not part of the command that the page shows."""
         self._module, self._arguments, self._folder = module, (*arguments, *hidden), folder
         self._ended, self._stopped, self._read = ended, False, 0
         self._child: Child | None = None

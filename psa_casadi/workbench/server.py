@@ -25,8 +25,8 @@ from psa_casadi.workbench.previews import Subject
 
 #: The name of the machine for itself, as addresses have it.
 HOST = "127.0.0.1"
-#: What a browser says of a request that the page itself, or nobody else's page, has caused.
-_OWN = ("same-origin", "none")
+#: Sec-Fetch-Site of a request that the page itself, or no other page, has caused.
+_SAME_SITE = ("same-origin", "none")
 _PAGE_ALONE = "Only the page itself may ask for this."
 
 
@@ -40,7 +40,7 @@ _SCRIPT = Markup(
         for name in ("begin", "columns", "files", "search", "workbench")
     )
 )
-#: What stands at the address with the token, and its only script: it leads to the page, which
+#: The page at the address with the token, and its only script: it leads to the page, which
 #: asks for all that follows, so that the token is in no address.
 _ENTER = "location.replace('/');"
 _DOOR = (
@@ -57,7 +57,7 @@ _PAGE_POLICY = {
     )
 }
 #: A report is a page of its own that runs its scripts and can reach nothing here, not even by the
-#: cookie; beside this its own policy holds.
+#: cookie; in addition its policy holds.
 _REPORT_POLICY = {
     "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
 }
@@ -87,7 +87,7 @@ def page(effects: Sequence[str], subject: Subject) -> str:
 
 
 class Server(ThreadingHTTPServer):
-    """Serves one desk at one port to who has the address; a request has a thread of its own.
+    """Serves one desk at one port to who has the address; each request has its thread.
 
     A token in the address opens the page, then a cookie does. The cookie is no part of an address,
     no script can read it, and a browser sends it with nothing that another site has caused. The
@@ -193,7 +193,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _look_at_cookie(self, why: str) -> None:
         """Refuse what has not the cookie, or is caused by another site."""
         cookie = None
-        if self.headers.get("Sec-Fetch-Site", "none") in _OWN:
+        if self.headers.get("Sec-Fetch-Site", "none") in _SAME_SITE:
             with contextlib.suppress(CookieError):
                 cookie = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
         if cookie is None or not _same(cookie.value, self.server.session):

@@ -423,7 +423,7 @@ class IdentificationFile:
     noise_kinds: tuple[NoiseFound, ...] = ()
 
 
-#: The doubts that tell it, and the name of the figure in each.
+#: The codes of the doubts that state this misfit, and the name of the figure in each.
 _MISSED = {"missed": "times", "output_missed": "ratio"}
 
 
@@ -590,7 +590,7 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `StackDiagnosis`.
 
     The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
-    it. A diagnosis of an own model gives what `Diagnosis` names so.
+    it. A diagnosis of another model answers by the names of `Diagnosis`.
 
     Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
     """

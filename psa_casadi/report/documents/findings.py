@@ -27,14 +27,14 @@ from psa_casadi.population.finding import (
 from psa_casadi.report.documents import files
 from psa_casadi.strict_json import decode, read_json
 
-#: The file in a device's folder that says how its work ended.
+#: The file in a device's folder with the status of its work.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 #: What `identify`, `diagnose` and `load_diagnosis` return.
 Result = Diagnosis | Identification | files.AnyDiagnosisFile
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
-#: Names of files that say what is in them, not of which device.
+#: Names of files that do not name a device.
 _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
 
@@ -46,11 +46,11 @@ def read_findings(
 ) -> tuple[Finding, ...]:
     """Return the findings in files, or of results at hand, in their order.
 
-    A result, of a stack or of a model of one's own, is what `identify`, `diagnose` and
+    A result, of a stack or of any other model, is what `identify`, `diagnose` and
     `load_diagnosis` return; it has the name of its first record. A path is a DIAGNOSIS.json, what
     `psa identify --json` wrote, a MODEL.json, or a device's folder of `psa batch`. A model of the
     same records as a diagnosis or identification is part of it. `traces` says whether models play
-    the records that their files carry. `effects` are own ones.
+    the records that their files carry. `effects` are a user's.
 
     Raises:
         InputError: what cannot be read, all of it.
@@ -178,7 +178,7 @@ def _identification(i: files.IdentificationFile) -> Finding:
 def _model(model: Model, traces: bool) -> Finding:
     origin = model.provenance
     trace = None
-    with suppress(PsaError):  # a page without this curve says more than no page
+    with suppress(PsaError):  # without the model's curve the page has all the rest
         trace = replayed(model) if traces else None
     return Finding(
         device="",
@@ -229,9 +229,9 @@ def _with_model(finding: Finding, model: Finding) -> Finding:
 
 
 def _named(reads: Sequence[_Read]) -> tuple[Finding, ...]:
-    """Name findings by their device, else by the shortest end of their path that is their own.
+    """Name findings by their device, else by the shortest end of their path that is unique.
 
-    A file whose name says only what it is has that of its folder.
+    A file with a usual name, such as diagnosis.json, has that of its folder.
     """
     names, depth = [], 1
     for path, finding in reads:

@@ -11,10 +11,10 @@ from psa_casadi.report.words.tables import check_table
 
 @dataclass(frozen=True)
 class Case:
-    """One test: its name, what was found, and why it failed, "" where it passed."""
+    """One test: its name, its result, and why it failed, "" where it passed."""
 
     name: str
-    found: str
+    result: str
     failure: str = ""
 
 
@@ -54,6 +54,6 @@ def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float
         if case.failure:
             failure = {"message": plain(case.failure), "type": "failure"}
             ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)
-        ElementTree.SubElement(test, "system-out").text = plain(case.found)
+        ElementTree.SubElement(test, "system-out").text = plain(case.result)
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"

@@ -26,7 +26,7 @@ from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
 _HEIGHT, _MOST_POINTS = 360, 4000
-#: Time shown of a move and its hold at first, over the move's; the rest is behind the zoom.
+#: Duration of a move and its hold in the plot, over the move's; the zoom shows the rest.
 _SHOWN = 2.5
 _FREE = Mounting(0.0, 0.0, 0.0)
 #: Samples of the step that the page's model runs on.
@@ -48,7 +48,7 @@ def write_design_page(
     The first sentence of `summary` is the result, the others follow as a list; then come the
     figures and the tables with their notes. `badges` are short marks under the title, such as
     "2,000 samples". `live` is a model that runs in the page on the designed voltage; where no
-    script runs, a picture of it is seen, beside its path if it has one.
+    script runs, a picture shows it, with its path if it has one.
 
     Raises InputError when `path` cannot be written to.
     """

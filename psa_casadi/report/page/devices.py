@@ -1,4 +1,4 @@
-"""Pages of several devices: a few side by side, or a population and who stands out of it."""
+"""Pages of several devices: a few side by side, or a population with its outliers."""
 
 import os
 from collections import Counter
@@ -25,7 +25,7 @@ from psa_casadi.shown import frame
 MOST = 20
 #: Columns of a comparison as text.
 _WIDTH = 100
-#: Tiles at the top for so many devices; the table has all.
+#: Devices with a tile at the top; the table has all.
 _MOST_TILES = 4
 #: Parameters that have a plot; those in which devices stand out come first.
 _MOST_PLOTS = 12
@@ -33,13 +33,13 @@ _MOST_PLOTS = 12
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Devices side by side: what was found of each, and the parameters that several tell."""
+    """Devices side by side: the results of each, and the parameters that several determine."""
 
     findings: tuple[Finding, ...]
 
     @cached_property
     def differences(self) -> tuple[Difference, ...]:
-        """Every parameter that two devices or more tell, with p of "all have one value"."""
+        """Every parameter that two devices or more determine, with p of "all have one value"."""
         return differences(self.findings)
 
     @property
@@ -80,10 +80,10 @@ class Comparison:
 def compare(
     *results: str | os.PathLike[str] | Result, effects: Sequence[Component] = ()
 ) -> Comparison:
-    """Compare two devices or more, stacks or of a model of one's own.
+    """Compare two devices or more, stacks or of any other model.
 
     `results` are what `identify`, `diagnose` and `load_diagnosis` return, or files of these
-    (`read_findings`); `effects` are own ones that MODEL.json names.
+    (`read_findings`); `effects` are a user's that MODEL.json names.
 
     Raises InputError for fewer than two, and for what cannot be read.
     """

@@ -4,6 +4,7 @@ import base64
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,11 +42,11 @@ _SAMPLES, _RECORDS = 12_000, 6
 _BENT = 5e-3
 #: A parameter that spans decades is moved by this factor to both sides.
 _DECADES = 10.0
-#: A slider reaches so many half widths of the 95 % interval to both sides, at least.
+#: Reach of a slider to both sides, at least, in half widths of the 95 % interval.
 _HALF_WIDTHS = 2.0
-#: And from 0 so many ordinary changes.
+#: Reach of a slider from a value of 0, in ordinary changes.
 _TYPICAL = 4.0
-#: What stands for an infinite bound: JSON has none.
+#: The number for an infinite bound: JSON has none.
 _NO_BOUND = 1e300
 
 
@@ -55,9 +56,9 @@ class LiveRecord:
 
     `inputs` are arrays (n,) in SI units by name, between samples as `hold` says; a loop is drawn
     over the one `along`. `deviation` holds the start of states off where a stack's voltage puts
-    them, any other model begins at the states `start` (nx,). A sensor with an `offset` has it found
-    again. `floor` is the noise that errors are judged by, `correction` what an unnamed correction
-    adds. It begins in motion, or at `rest`.
+    them, any other model starts at the states `start` (nx,). A sensor with an `offset` has it
+    estimated again. `floor` is the noise that errors are judged by, `correction` what an unnamed
+    correction adds. It starts in motion, or at `rest`.
     """
 
     series: Series
@@ -74,13 +75,13 @@ class LiveRecord:
 
     @property
     def residual(self) -> FloatArray:
-        """What the model leaves as it was fitted."""
+        """The residual of the fitted model."""
         return self.series.residual(self.series.curves[-1])
 
 
 @dataclass(frozen=True, eq=False)
 class LiveModel:
-    """A model that a page is to hold, with the compilation of its module that has begun.
+    """A model for a page, with its module, which is being compiled.
 
     `aim` is what it is compared with; a `design` has neither noise nor a sensor with an offset.
     """
@@ -94,7 +95,7 @@ class LiveModel:
     correction: str = ""
 
     def page_data(self) -> dict[str, Any] | None:
-        """Return what live.js must know, once the module is there; None where there is none."""
+        """Return the data for live.js, once the module is compiled; None without a module."""
         module = self.module.result()
         if module is None:
             return None
@@ -109,12 +110,12 @@ class LiveModel:
             units = (s.scale, s.residual_scale) if s.unit else (length, error)
             over = f"{s.title} over {r.along}" if r.along else ""
             labels = map(in_brackets, (s.quantity, "difference"), (q.unit for q in units))
-            rows.append({
-                **_record(r, limit, self.design),
-                **{n: asdict(q) for n, q in zip(("length", "error"), units, strict=True)},
-                "captions": [f"{s.title} over time", over, f"{self.aim} minus model".capitalize()],
-                "labels": [next(labels), s.against, next(labels)],
-            })  # fmt: skip
+            row = _record(r, limit, self.design)
+            row |= {n: asdict(q) for n, q in zip(("length", "error"), units, strict=True)}
+            difference = f"{self.aim} minus model".capitalize()
+            row["captions"] = [f"{s.title} over time", over, difference]
+            row["labels"] = [next(labels), s.against, next(labels)]
+            rows.append(row)
         return {
             "kind": "report",
             **live_data(self.model, module),
@@ -125,7 +126,7 @@ class LiveModel:
         }
 
     def cure(self) -> str:
-        """Return why the model does not run in the page, and what would make it."""
+        """Return why the model does not run in the page, and the remedy."""
         if self.model.structure.foreign:
             return "It is an imported FMU, of which a page has no equations."
         if self.model.sampled_names:
@@ -134,7 +135,7 @@ class LiveModel:
 
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of a diagnosis alive; `rows` are its series."""
+    """Start to compile the model of a diagnosis for its page; `rows` are its series."""
     module, beyond, share, text = begun_module(d.model), list[FloatArray](), 1.0, ""
     if isinstance(d, StackDiagnosis):
         # the page's other errors are judged by the noise of all records together
@@ -147,7 +148,7 @@ def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> Liv
 
 
 def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of an identification alive; `rows` are its series."""
+    """Start to compile the model of an identification for its page; `rows` are its series."""
     records = _fitted_records(
         identification.model, identification.fit, identification.experiments, rows
     )
@@ -161,10 +162,10 @@ def live_design(
     *,
     rest: bool = False,
 ) -> LiveModel:
-    """Begin what lets a model run on a designed voltage.
+    """Start to compile a model that runs on a designed voltage.
 
     `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
-    to follow, where there is one. The model begins in motion, or at `rest`.
+    to follow, where there is one. The model starts in motion, or at `rest`.
     """
     time, voltage, displacement = record
     aim, words = (displacement, "design") if wanted is None else (wanted, "path")
@@ -175,12 +176,13 @@ def live_design(
 
 
 def live_experiment(model: Model, record: Signals) -> LiveModel:
-    """Begin what lets any model but a stack run on a designed record, from its declared starts."""
+    """Start to compile any model but a stack that runs on a designed record."""
     s, time = model.structure, record.time - record.time[0]
     start = np.array([q.start for q in s.states])
     u = input_samples(model, record.n, record.columns)
     outputs = run(model, time, u, start, hold=record.hold).y.T
     along, none = next(iter(record.columns)), np.zeros(record.n, dtype=bool)
+    live_record = partial(LiveRecord, along=along, start=start, hold=record.hold)
     rows = []
     for output, y in zip(s.outputs, outputs, strict=True):
         series = Series(
@@ -188,12 +190,7 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
             none, noise=0.0, counts=False, quantity=output.name, unit=output.unit,
             against=in_brackets(along, record.units[along]),
         )  # fmt: skip
-        rows.append(
-            LiveRecord(
-                series, record.columns, output=output.name, along=along, start=start,
-                hold=record.hold,
-            )
-        )  # fmt: skip
+        rows.append(live_record(series, record.columns, output=output.name))
     return LiveModel(model, begun_module(model), rows, aim="design", design=True)
 
 
@@ -229,7 +226,7 @@ def _fitted_records(
 
 
 def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
-    """Return a record as a page holds it, in SI units, its time from its own first sample on."""
+    """Return a record as a page holds it, in SI units, its time from its first sample on."""
     s = r.series
     part, note = thinned(s.time, [*r.inputs.values()], limit)
     t = s.time[part] - s.time[0]
@@ -262,10 +259,10 @@ def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
 
 
 def thinned(t: FloatArray, inputs: Sequence[FloatArray], limit: int) -> tuple[IndexArray, str]:
-    """Return at most `limit` samples of a record and what must be said of them.
+    """Return at most `limit` samples of a record, and a note on their choice.
 
-    Every so-manieth one if the inputs are straight between them, else those of the beginning: a
-    model's answer to a voltage with its corners cut is that to another voltage.
+    They are evenly spaced if the inputs are straight between them, else the first ones: the
+    response to a voltage with its corners cut is that to another voltage.
     """
     n = len(t)
     if n <= limit:

@@ -26,9 +26,9 @@ from psa_casadi.report.page.document import packed, render
 from psa_casadi.report.page.live import live_data
 from psa_casadi.variables import Provenance
 
-#: The stack that a page has where no model is given, and where the answer to a step ends [kHz].
+#: The stack of a page without a model, and the end of the frequency response [kHz].
 STACK, _BAND = "P-885.51", 100.0
-#: What stands in the texts for the model's name.
+#: The placeholder of the model's name in the texts.
 NAME = "psa_name_in_page"
 _README = "sources/README.txt"
 #: Kinds of variables whose usual size follows from the values of parameters.

@@ -42,7 +42,7 @@ _MOST_SAMPLES = 13_000
 MOST_RECORDS = 16
 #: Causes whose signatures are drawn, views of residuals, records and sentences that are listed.
 _SIGNATURES, _VIEWS, _TOLD_RECORDS, _TOLD = 3, 3, 4, 6
-#: Of any model: outputs whose errors are drawn, series that are told, effects with bars.
+#: Of any model: outputs whose errors are drawn, series with a sentence, effects with bars.
 _OUTPUTS, _SERIES, _EFFECTS = 4, 4, 16
 #: What a page shows of a stack, or of some diagnoses alone.
 _OF_STACK = (
@@ -51,14 +51,6 @@ _OF_STACK = (
 )  # fmt: skip
 #: Views that show nearly the same as another one: of these, and of gain and lag, one is drawn.
 _FAMILIES = {"displacement": "voltage", "from_reversal": "since_reversal"}
-_STATUSES = {
-    "fit": "good",
-    "read off": "good",
-    "fit, weak": "weak",
-    "fit, undetermined": "bad",
-    "fit, on its bound": "bad",
-    "not fitted": "quiet",
-}
 
 
 def write_report(
@@ -95,8 +87,8 @@ def write_fit_report(
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
-    `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model runs in the page.
+    `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` follow the
+    determinacy. Unless it is to be `still`, the model runs in the page.
 
     Raises InputError when `path` cannot be written to.
     """
@@ -265,7 +257,6 @@ def fit_page(
                 for p in profiles
             ],
             starts=tables.starts_table(identification.starts, series[0].residual_scale),
-            statuses=_STATUSES,
             errors=tables.fit_error_table(series, figures),
         )
 
@@ -299,9 +290,9 @@ def _shared(
     origin: str,
     identification: Identification | None = None,
 ) -> dict[str, Any]:
-    """Return what pages of results show: the record that is missed most, every record, parameters.
+    """Return the parts of all pages of results: the worst record, all records, parameters.
 
-    On the page of a fit, `identification`, the former is only seen where no script runs.
+    On the page of a fit, `identification`, the former appears only if no script runs.
     """
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
@@ -321,11 +312,9 @@ def _shared(
     return {
         "badges": [f"{origin} data", f"{count} record{'s' if count > 1 else ''}"],
         "origin": origin,
-        "worst": {
-            "name": worst.name,
-            "figure": record_figure(worst, origin=origin),
-            "picture": below,
-        },
+        "worst": worst,
+        "still": record_figure(worst, origin=origin),
+        "below": below,
         "parts": [
             _part(
                 series[k], figures[k], origin, limit, identification or series[k].name != worst.name
@@ -353,7 +342,7 @@ def _shaded(s: Series) -> str:
 def _part(
     s: Series, figures: ResidualFigures, origin: str, limit: int, timed: Any
 ) -> dict[str, Any]:
-    """Return what is shown of a record: over time where it is `timed`, and the residual's views."""
+    """Return the views of a record and its residual; over time only if it is `timed`."""
     noise = "Dashed: two standard deviations of the noise."
     driver = s.against.partition(" [")[0]
     indices = records.samples(s, limit)
@@ -415,7 +404,7 @@ def _budget(d: Diagnosis) -> dict[str, Any]:
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
     """Return record and name of the views with the largest shares, one of every family.
 
-    "spectrum" stands for the lines that are not the drive's.
+    "spectrum" means the lines that are not the drive's.
     """
     best: dict[str, tuple[float, Misfit, str]] = {}
     for m in misfits:
@@ -475,7 +464,7 @@ def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Ta
 
 
 def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
-    """Return the signature of a cause beside the same view of the record that shows most of it."""
+    """Return the signature of a cause with the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None

@@ -61,7 +61,7 @@ _MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
 _COLUMNS = 4
 #: Outputs or columns of a record in one picture.
 _MOST_ROWS = 8
-#: A legend above the plot, beside its title, and one over the curves.
+#: A legend above the plot, right of its title, and one over the curves.
 _ABOVE = {
     "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
     "frameon": False, "columnspacing": 1.2, "handlelength": 1.4,
@@ -176,7 +176,7 @@ def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
     return figure
 
 
-#: Lines that lie on each other are seen; and what an output is over its usual size that is none.
+#: Styles by which curves that coincide stay visible; the relative size of a zero response.
 _LINES, _NOTHING = ("-", "--", "-.", ":"), 1e-9
 
 
@@ -362,7 +362,7 @@ def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: st
 
 
 def posterior_figure(posterior: Posterior) -> Figure:
-    """Return what prior and posterior predict of the record missed most, and the parameters."""
+    """Return the predictive bands for the record with the largest misfit, and the parameters."""
     block = _missed_most(posterior)
     figures = posterior.figures[:_MOST_PARAMETERS]
     rows = -(-len(figures) // _COLUMNS)
@@ -396,7 +396,7 @@ def _missed_most(posterior: Posterior) -> Block:
 
 
 def _scale(posterior: Posterior, b: Block, size: float) -> phrases.Scale:
-    """Return what numbers of a block of this size are shown in."""
+    """Return the unit for numbers of a block of this size."""
     unit = posterior.task.channel(b).unit
     return phrases.length_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
 
@@ -466,7 +466,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     """Write the picture of an effect's signature, 1300 x 620 points, whole or not at all.
 
     It is an SVG or a PDF where `path` ends so, else a PNG. Left the difference over time above the
-    voltage's ghost, right against the coordinate that tells it best. Raises InputError when `path`
+    voltage's ghost, right against its most telling coordinate. Raises InputError when `path`
     cannot be written to.
     """
     figure = sheet((13.0, 6.2), DPI)

@@ -1,4 +1,4 @@
-"""What is found: evidence of effects, views of a residual, signatures, what is determined."""
+"""Plots of findings: evidence of effects, views of a residual, signatures, determinacy."""
 
 import math
 from typing import Any
@@ -26,7 +26,7 @@ _DEGREE_COLOURS: dict[Degree, str] = {
     "on its bound": colours.BOUND,
     "fixed": colours.NOISE,
 }
-#: The bars begin and end here [%]; what lies beyond says so in its figure.
+#: The range of the bars [%]; a figure beyond it has a mark.
 _SHORTEST, _LONGEST = 0.01, 1000.0
 #: Heights of a bar, and of a plot's margins with its axis and legend.
 _BAR, _MARGINS = 22, 124
@@ -37,13 +37,13 @@ _LOW = 300
 _BEHIND, _SAMPLES = 1000, 3000
 #: Kinds of an unnamed correction that lie over another variable than the time.
 _CURVED = ("curve", "direction", "memory")
-#: The cost is shown up to this many limits; beyond, a curve only hides its foot.
+#: The end of the cost axis over the limit, so that the minimum stays readable.
 _TOP = 2.5
 _PARABOLA_POINTS = 81
 
 
 def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
-    """One bar for every effect that was tried; text says the share of the excess it explains.
+    """One bar for every effect that was tried, with the share of the excess that it explains.
 
     Named causes come first, with their confidence. Of many, the first and most telling ones where
     only so many are to be drawn.
@@ -120,10 +120,8 @@ def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool
 
 def signature_plot(signature: Signature) -> Panel:
     """What an effect adds along its telling coordinate: samples behind their binned means."""
-    view, scale = (
-        signature.telling,
-        phrases.length_scale(float(np.max(np.abs(signature.difference)))),
-    )
+    view, largest = signature.telling, float(np.max(np.abs(signature.difference)))
+    scale = phrases.length_scale(largest)
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
     look: dict[str, Any] = {"line": {"color": colours.EXTENDED, "width": 1.8}}
@@ -145,7 +143,7 @@ def signature_plot(signature: Signature) -> Panel:
 def _view_panel(
     view: View, scale: phrases.Scale, what: str, arrays: list[FloatArray]
 ) -> tuple[Panel, float]:
-    """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
+    """Return an empty plot of a view, and the factor from its coordinate to the axis."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
     plot = Panel(
         f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
@@ -229,23 +227,19 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
 def correlation_plot(identification: Identification) -> Panel:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
     names, matrix = list(identification.determinacy.names), identification.determinacy.correlations
-    written, rows = (
-        len(names) <= _MOST_FIGURES,
-        max(10, len(identification.model.structure.parameters)),
-    )
+    has_figures = len(names) <= _MOST_FIGURES
+    rows = max(10, len(identification.model.structure.parameters))
     plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
              for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
-    for sign, colour, name in (
-        (1.0, colours.EXTENDED, "positive"),
-        (-1.0, colours.BASE, "negative"),
-    ):
+    signs = ((1.0, colours.EXTENDED, "positive"), (-1.0, colours.BASE, "negative"))
+    for sign, colour, name in signs:
         part = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
         look = {"color": colour, "opacity": [abs(v) for _, _, v in part]}
-        plot.bars(  # a cell is a bar that begins at its column
+        plot.bars(  # a cell is a bar with its base at its column
             [0.92] * len(part), [names[i] for i, _, _ in part], name, look, width=0.92,
             base=[k - 0.46 for _, k, _ in part],
-            text=[_correlation_text(v) if written and i > k else "" for i, k, v in part],
+            text=[_correlation_text(v) if has_figures and i > k else "" for i, k, v in part],
             textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
             textfont={"size": 10, "color": colours.INK},
             hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in part],
@@ -280,7 +274,7 @@ def profile_plot(p: Profile) -> Panel:
     plot = Panel(f"{p.name}{unit}", "increase of the cost", 380)
     plot.marks(values, p.increase, "all other parameters fitted anew",
                line={"color": colours.EXTENDED, "width": 2.0})  # fmt: skip
-    if p.log:  # what the standard error alone says, in the logarithm where it has one
+    if p.log:  # the linearised interval, in the logarithm where it has one
         at = np.geomspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = np.log(at / p.estimate) * p.estimate / p.standard_error
     else:

@@ -1,4 +1,4 @@
-"""What is seen of one record: time, loop, window, and the residual in several views."""
+"""Plots of one record: over time, loop, window, and the residual in several views."""
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from psa_casadi.units import FloatArray, IndexArray
 
 Samples = slice | IndexArray
 
-#: Points of a part of a record, measured samples shown one by one, and of a spectrum.
+#: Points of a part of a record, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
 _FULL = 500
-#: A residual is far off if it is so many times wider than the one that is to be read.
+#: Ratio of widths from which on a residual is too wide for the axis of the last one.
 _FAR = 6.0
 
 
@@ -47,7 +47,7 @@ def residual_plot(s: series.Series, indices: Samples) -> Panel:
 
 
 def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
-    """What was measured over time in the window where the curves are easiest to tell apart."""
+    """What was measured over time in the window where the curves differ most."""
     window = series.telling_window(s)
     indices = np.arange(len(s.time))[window]
     indices = indices[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
@@ -104,7 +104,7 @@ def autocorrelation_plot(s: series.Series) -> Panel:
 
 
 def distribution_plot(s: series.Series) -> Panel:
-    """Share of samples over the size of every curve's residual, beside a normal distribution.
+    """Share of samples over the size of every curve's residual, with a normal distribution.
 
     Where the others are far off, the axis is that of the last one; their names say how much of
     them lies outside.

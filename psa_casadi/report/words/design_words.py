@@ -45,10 +45,8 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
     promises = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
     record, parts = design.record, []
     for name, values in record.columns.items():
-        unit, rate = (
-            record.units[name],
-            float(np.max(np.abs(np.diff(values) / np.diff(record.time)))),
-        )
+        unit = record.units[name]
+        rate = float(np.max(np.abs(np.diff(values) / np.diff(record.time))))
         current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
         in_unit = "" if unit == "1" else f" {unit}"
         per_second = f"{in_unit} a second" if in_unit == "" or "/" in unit else f"{in_unit}/s"
@@ -182,7 +180,7 @@ def _pole(pole: complex) -> str:
 
 
 def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
-    """Return the result in sentences: reached or not, what stands in the way, the lag's pole."""
+    """Return the result in sentences: reached or not, the binding limits, the lag's pole."""
     wanted = " and ".join(d.goals)
     if d.attained:
         first = f"Wanted {wanted}: reached within the limits."
@@ -207,7 +205,7 @@ def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
 
 
 def error_table(rows: list[tuple[str, TrackingError]]) -> Titled:
-    """Return errors in percent of the path's range, rms and largest, by who says so."""
+    """Return errors in percent of the path's range, rms and largest, by source."""
     body = tuple((n, number(e.rms_percent), number(e.largest_percent)) for n, e in rows)
     return Titled("Errors", Table(("voltage, judged by", "rms [% of range]", "largest [%]"), body))
 

@@ -61,7 +61,7 @@ def grade(identification: Identification, name: str) -> Grade:
 def determined(model: Model, identification: StackIdentification | None = None) -> frozenset[str]:
     """Return the parameters that the records determine, if only weakly.
 
-    Without the identification that found them they are those whose 95 % interval is that of a
+    Without an identification they are those whose 95 % interval is that of a
     standard error below `DETERMINED_WIDTH`.
     """
     if identification is not None:
@@ -97,7 +97,7 @@ def strong_pairs(identification: Identification) -> list[tuple[str, str, float]]
 
 
 #: Shares of the lags beyond the 95 % band up to which a residual passes for white, with the
-#: correlation of neighbours that no eye tells from none.
+#: correlation of neighbours that is negligible.
 _WHITE_SHARE, _WHITE_NEIGHBOURS = 0.12, 0.05
 _SHAPE = 0.5
 

@@ -60,7 +60,7 @@ def weight(m: Misfit) -> float:
 
 
 def strongest(misfits: Sequence[Misfit]) -> Note | None:
-    """Return what says most of what is wrong, None if nothing is above the noise."""
+    """Return the finding with the largest excess, None if nothing is above the noise."""
     above_noise = [m for m in misfits if len(m.findings) > 1]
     return max(above_noise, key=weight).findings[1] if above_noise else None
 

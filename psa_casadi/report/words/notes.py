@@ -1,4 +1,4 @@
-"""The sentences of notes: what each code says, with the note's values in its places."""
+"""The sentences of notes by code, with the note's values in their places."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -333,7 +333,7 @@ def _identification(identification: Identification) -> str:
 
 
 def _estimate(value: float, low: float, high: float) -> str:
-    """Return a value with its interval, in as many digits as tell them apart, four at least."""
+    """Return a value with its interval, in as many digits as distinguish them, four at least."""
     half = max(high - value, value - low)
     digits = 4
     if 0.0 < half < abs(value):
@@ -426,7 +426,7 @@ class _Words(Formatter):
     """Formats quantities `(value, unit)` with their units, and names in a row.
 
     What follows the colon is a number's format, ".0p" that of a percentage without its sign, or
-    what stands between names, ", " by default.
+    the separator of names, ", " by default.
     """
 
     def format_field(self, value: Any, format_spec: str) -> str:

@@ -12,7 +12,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import convert
 
-#: A length in a sentence stays in its own unit where the page's would give a larger number.
+#: A length in a sentence keeps its usual unit where the page's would give a larger number.
 _LARGEST = 1000.0
 #: Units of quantities in sentences, the largest first, and the least value that each is for.
 _IN_SENTENCES: dict[str, tuple[tuple[str, float], ...]] = {
@@ -28,7 +28,7 @@ _PREFIXES = (("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n",
 
 @dataclass(frozen=True)
 class Scale:
-    """A unit to show a length in: `shown = factor * metres` (counts are shown as they are)."""
+    """A unit to show a length in: `number = factor * metres`; counts stay counts."""
 
     unit: str
     factor: float
@@ -84,12 +84,12 @@ def prefixed_scale(largest: float, unit: str) -> Scale:
 
 
 def in_brackets(what: str, unit: str) -> str:
-    """Return what an axis says: the quantity with its unit in brackets, if it has one."""
+    """Return the label of an axis: the quantity with its unit in brackets, if it has one."""
     return f"{what} [{unit}]" if unit not in ("", "1") else what
 
 
 def number(value: float, digits: int = 3, *, trim: bool = False) -> str:
-    """Return a number with so many significant digits, with an exponent only where it helps.
+    """Return a number with a count of significant digits, with an exponent only where it helps.
 
     With `trim` it ends in no zeros behind its point.
     """
@@ -134,7 +134,7 @@ _LABEL = 10
 
 
 def labelled(rows: Iterable[tuple[str, str]], width: int) -> str:
-    """Return texts beside their labels, in lines of the given width."""
+    """Return texts behind their labels, in lines of this width."""
     return "\n".join(
         # a percent sign stays with its number
         textwrap.fill(
@@ -150,12 +150,12 @@ def labelled(rows: Iterable[tuple[str, str]], width: int) -> str:
 
 
 def raised(text: str) -> str:
-    """Return a text that begins with a capital."""
+    """Return a text with a capital at its start."""
     return f"{text[:1].upper()}{text[1:]}"
 
 
 def lowered(text: str) -> str:
-    """Return a text that begins without a capital."""
+    """Return a text with a small letter at its start."""
     return f"{text[:1].lower()}{text[1:]}"
 
 
@@ -183,7 +183,7 @@ def confidence_text(confidence: float) -> str:
 def share_text(candidate: Candidate, d: Diagnosis) -> str:
     """Return the share of the excess that an effect explains alone, or that it was only screened.
 
-    Of one of several named causes also what it removes beside the others.
+    Of one of several named causes also what it removes together with the others.
     """
     if not candidate.fitted and candidate.explained_share == 0:
         alone = "screened"
@@ -256,7 +256,7 @@ def in_display_unit(model: Model, name: str, *values: float) -> tuple[str, list[
 
 
 def interval_text(low: float, high: float) -> str:
-    """Return an interval; one over more than four decades says that nothing was determined."""
+    """Return an interval; one over more than four decades counts as not determined."""
     if not (math.isfinite(low) and math.isfinite(high)) or (low > 0 and high > 1e4 * low):
         return "not determined"
     digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)

@@ -25,7 +25,7 @@ from psa_casadi.units import convert
 
 #: The output of a stack.
 _LENGTH = "displacement"
-#: So many names stand in a sentence; the table has all.
+#: Names in a sentence, at most; the table has all.
 _MOST_NAMED = 6
 METHOD = (
     "Every estimate comes with the interval of its own fit. The spread tau of the devices is what"
@@ -40,7 +40,7 @@ METHOD = (
 
 
 class _ParameterText:
-    """A parameter's estimates as text, in the unit that the parameter is shown in."""
+    """A parameter's estimates as text, in the display unit of the parameter."""
 
     def __init__(self, e: population.Estimates) -> None:
         self.e, self.name, self.unit = e, e.name, population.display_unit(e.name, e.unit)
@@ -121,7 +121,7 @@ def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
 
 
 def population_tables(p: population.Population) -> dict[str, Table]:
-    """Return who stands out, every parameter over the devices, batches, drift, and how often what.
+    """Return the tables of outliers, parameters, batches, drifts, verdicts and causes.
 
     That is: value, what the others predict, z and adjusted p; mean and spread; the means of batches
     that differ; the change over a year; verdicts and causes with Wilson's interval of their share.
@@ -141,33 +141,16 @@ def population_tables(p: population.Population) -> dict[str, Table]:
         )  # fmt: skip
     for name, s in spreads.items():
         common, text = s.common, _ParameterText(s.estimates)
-        rows.append(
-            (
-                name,
-                str(len(s.estimates.places)),
-                text.value(float(common.b[0])),
-                text.interval(common.interval()),
-                text.spread(common.tau),
-                text.spreads(common.tau_interval),
-                _p(common.p_value),
-                str(sum(o.parameter == name for o in p.outliers)),
-                _p(p.batch_p.get(name)),
-                _p(p.drift_p.get(name)),
-            )
-        )
+        centre = text.value(float(common.b[0])), text.interval(common.interval())
+        spread = text.spread(common.tau), text.spreads(common.tau_interval), _p(common.p_value)
+        count, outside = len(s.estimates.places), sum(o.parameter == name for o in p.outliers)
+        tests = _p(p.batch_p.get(name)), _p(p.drift_p.get(name))
+        rows.append((name, str(count), *centre, *spread, str(outside), *tests))
         if s.batches is not None and name in p.batches_differ:
-            batches += [
-                (
-                    name,
-                    b.name,
-                    str(b.devices),
-                    text.value(b.mean),
-                    text.interval(b.interval),
-                    text.spread(b.differs_by),
-                    _p(b.p_adjusted),
-                )
-                for b in s.batches.batches
-            ]
+            for b in s.batches.batches:
+                centre = text.value(b.mean), text.interval(b.interval)
+                differs = text.spread(b.differs_by), _p(b.p_adjusted)
+                batches.append((name, b.name, str(b.devices), *centre, *differs))
         if s.drift is not None and name in p.drifting:
             slope = text.spread(s.drift.slope)
             drifts.append((name, slope, text.spreads(s.drift.interval), _p(p.drift_p[name])))
@@ -199,7 +182,7 @@ def _counts(what: str, rows: Sequence[population.Frequency]) -> Table:
 
 
 def left_out_sentence(p: population.Population) -> str:
-    """Say which parameters too few devices tell, "" where there are none."""
+    """Name the parameters that too few devices determine, "" where there are none."""
     if not p.left_out:
         return ""
     return f"Told by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."

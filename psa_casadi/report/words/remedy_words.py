@@ -34,7 +34,7 @@ from psa_casadi.report.words.verdict_words import within
 
 _FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"
 
-#: What can be done. Those below the line are the kinds of effects of a model of one's own.
+#: What can be done. Those below the comment are the kinds of effects of any other model.
 DO: Mapping[str, str] = {
     "extended_model": "Use the extended model in the place of the base",
     "wait_or_feed_forward": (
@@ -87,7 +87,7 @@ DO: Mapping[str, str] = {
         "Keep the temperature steady, start when the set-up has warmed up, or record the"
         " temperature and correct by it"
     ),
-    # a model of one's own
+    # any model but a stack
     "lag": "Drive slower, use a faster device there, or keep the lag in the model",
     "delay": "Shift the time of that signal, sample by one clock, or keep the delay in the model",
     "bend": "Calibrate that signal and correct it by the curve, or keep the curve in the model",
@@ -178,7 +178,7 @@ def _amount(size: Size, length: Scale) -> str:
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
 _FILES = ("model.json", "extended.json")
-#: Causes whose remedies are told, and rivals of each.
+#: Causes with a remedy, and rivals of each.
 _CAUSES, _RIVALS = 3, 2
 
 
@@ -252,10 +252,10 @@ def _further(d: Diagnosis) -> str:
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the commands that take the model further, and what must be said of its file."""
+    """Return the commands that take the model further, and remarks on its file."""
     stack = d if isinstance(d, StackDiagnosis) else None
     if not (stack or model_file or added(d)):
-        return (), ()  # what there is of one's own is its equations
+        return (), ()  # its equations are already there
     file = model_file or _FILES[added(d)]
     if d.model.structure.foreign:
         around = d.causes and all(c.belongs_to in ("drive", "sensor") for c in d.causes)

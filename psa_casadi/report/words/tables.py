@@ -51,8 +51,8 @@ class Table:
     def fitted(self, width: float = math.inf) -> str:
         """Return the table in columns of plain text whose lines have `width` characters at most.
 
-        Cells go on in further lines where their column is narrower. `laid_out` says which way the
-        table lies.
+        Cells go on in further lines where their column is narrower. `laid_out` decides which way
+        the table lies.
         """
         return self.laid_out(width)._lines(width)
 
@@ -109,9 +109,9 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 def parameter_table(
     model: Model, identification: Identification | None = None, only: Collection[str] | None = None
 ) -> Table:
-    """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
+    """Return every parameter with value, 95 % interval, unit, source, and meaning.
 
-    Those named in `only`, where that is given.
+    With `only` those that it names.
     """
     rows = []
     for p in (p for p in model.structure.parameters if only is None or p.name in only):
@@ -144,9 +144,9 @@ def candidate_table(d: Diagnosis) -> Table:
 
 
 def error_table(d: Diagnosis, scale: Scale) -> Table:
-    """Return the errors of base and extended model beside the noise.
+    """Return the errors of base and extended model, and the noise.
 
-    Of a stack they are lengths in the unit of the scale, else those of every output in its own.
+    Of a stack they are lengths in the unit of the scale, else those of every output in its unit.
     """
     if not isinstance(d, StackDiagnosis):
         rows = [(e.output, e.unit, e.noise, e.base, e.extended) for e in d.errors]
@@ -191,7 +191,7 @@ def _falls(
 
 
 def column_table(d: StackDiagnosis) -> Table:
-    """Return what base and extended model miss of every further column, beside its noise."""
+    """Return what base and extended model miss of every further column, and its noise."""
     rows = []
     for c in d.columns:
         errors = (c.noise, c.base_rms, c.extended_rms if added(d) else None)
@@ -202,7 +202,7 @@ def column_table(d: StackDiagnosis) -> Table:
 
 
 def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]) -> Table:
-    """Return what the model leaves of every record, beside the record's noise level.
+    """Return what the model leaves of every record, and the record's noise level.
 
     Each quantity has its unit, that of its largest error.
     """
@@ -323,7 +323,7 @@ def check_table(report: "CheckReport") -> Table:
 def timings_table(stages: Sequence[Stage]) -> Table:
     """Return time, processor time of all threads with its share, and simulations of every stage.
 
-    Behind the simulations stands how many of them were with sensitivities.
+    The last column counts the simulations with sensitivities.
     """
     figures = ((s.wall, s.processor, s.runs, s.differentiated) for s in stages)
     total = Stage("total", *map(sum, zip(*figures, strict=True)))

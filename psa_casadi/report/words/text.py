@@ -81,11 +81,8 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
-        lines += (
-            [("kind", statement)]
-            if (statement := verdict_words.family_sentence(c.families))
-            else []
-        )
+        if kind := verdict_words.family_sentence(c.families):
+            lines.append(("kind", kind))
         lines.append(("rivals", _rivals(d, c)))
     if stack:
         columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]
@@ -122,7 +119,7 @@ def _missed(e: OutputError, d: Diagnosis) -> str:
 
 
 def _rivals(d: Diagnosis, cause: Cause) -> str:
-    """Return what a cause cannot be told from, else the next most probable effect of the first."""
+    """Return the effects that the data cannot separate from a cause, else the next probable one."""
     known = {c.effect: c.probability for c in d.candidates}
     # the candidates are those of the first step, whose cause may be without a name
     steps = [c.what for c in d.budget.causes]

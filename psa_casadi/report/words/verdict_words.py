@@ -1,32 +1,33 @@
 """The verdict of a diagnosis and its error budget in sentences."""
 
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, Patch
 from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
-from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, StackDiagnosis
+from psa_casadi.diagnosis.result import (
+    Alternative,
+    Cause,
+    Decision,
+    Diagnosis,
+    StackDiagnosis,
+    Verdict,
+)
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
 
-VERDICTS = {
-    "adequate": "adequate",
-    "cause_named": "cause named",
-    "partly_explained": "partly explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "unexplained",
-    "not_driven": "not driven",
-}
+VERDICTS: dict[str, str] = {verdict: verdict.replace("_", " ") for verdict in get_args(Verdict)}
 
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
 #: A row of the budget.
 _REMAINS = "remains above the noise"
-#: What an interval of the gain from blocks of few records says.
+#: What an interval of the gain from blocks of few records means.
 OWN_VOLTAGES = (
     "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
     " for other voltages hold out four records or more (--holdout)."
@@ -98,7 +99,7 @@ def _named(d: Diagnosis) -> str:
 def of_range(d: Diagnosis, *, extended: bool = False) -> dict[str, float]:
     """Return a model's held-out error in every output, in % of its range in all records.
 
-    That of a stack's displacement is each record's over its own range.
+    That of a stack's displacement is each record's over that record's range.
     """
     if isinstance(d, StackDiagnosis):
         errors = d.extended_errors if extended else d.base_errors
@@ -125,7 +126,7 @@ def _base_errors(d: Diagnosis) -> str:
 
 
 def within(share: float) -> float:
-    """Return a share as it is shown, from 0 to 1."""
+    """Return a share cut to 0 and 1."""
     return max(0.0, min(1.0, share))
 
 
@@ -149,15 +150,15 @@ def _without_name(d: Diagnosis) -> str:
 
 
 def named_cause(cause: Cause) -> str:
-    """Name a cause with its place, how sure it is, and what it cannot be told from."""
+    """Name a cause with its place, its confidence, and its indistinguishable rivals."""
     sure = f"{phrases.place_of(cause)}, {phrases.confidence_text(cause.confidence)}"
     if cause.cannot_be_told_from:
         sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
     return f"{phrases.plain(cause.effect)} ({sure})"
 
 
-#: Something that was not tried is told from this probability on.
-_TOLD = 0.005
+#: Least probability from which on a sentence mentions what was not tried.
+_LEAST_REST = 0.005
 #: What effects of a kind do, and the places of a rig.
 _DOES = {
     "curve": "a bent static curve",
@@ -192,7 +193,7 @@ def family_sentence(families: Sequence[Family]) -> str:
             part += ", none of the listed effects"
         parts.append(part)
     rest = 1.0 - sum(f.probability for f in families)
-    if families and rest >= _TOLD:
+    if families and rest >= _LEAST_REST:
         parts.append(f"something that was not tried ({phrases.percent(rest)})")
     return phrases.listing(parts, "or")
 
