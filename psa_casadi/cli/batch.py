@@ -90,7 +90,7 @@ def batch(
         show(sentence)
     show_written(*done.files, report if whole else None)
     if report is not None and whole is None:
-        show(f"{report} was not written: fewer than four devices tell a parameter.")
+        show(f"{report} was not written: fewer than four devices determine a parameter.")
     if not done.findings:
         raise typer.Exit(1)
 

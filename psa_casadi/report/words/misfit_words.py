@@ -157,7 +157,7 @@ _EACH: Mapping[str, Callable[..., str]] = {
     ),
     "coloured": lambda where, unit, at, rms, time: (
         f"What is left of {where} is correlated over {quantity(time, 's')}; from these records it"
-        " may be noise, or something that the model lacks. A voltage that is played twice tells."
+        " may be noise, or something that the model lacks. A voltage that is played twice decides."
     ),
     "telegraph": lambda where, unit, at, count, apart: (
         f"The noise of {where} jumps {_times(count)} between two levels, {quantity(apart, unit)}"
@@ -187,7 +187,7 @@ _EACH: Mapping[str, Callable[..., str]] = {
     ),
     "quantised": lambda where, unit, at, step, rms: (
         f"What is left of {where} is rounding to steps of {quantity(step, unit)}; nothing smaller"
-        " can be told. Take a smaller range of the sensor or a finer converter."
+        " is resolved. Take a smaller range of the sensor or a finer converter."
     ),
     "held": lambda where, unit, at, share, run: (
         f"{100.0 * share:.0f} % of the readings of {where} repeat the one before: the sensor is"
@@ -229,7 +229,7 @@ def _noise_enters(
     where = f"a load in the rate of {place}" if rate else f"noise at the input {place}"
     return (
         f"What is left of '{output}' is likelier {where} ({size}{'; a walk' if walks else ''}) than"
-        f" noise of its sensor, by {nats:.0f} nats: nothing is missing that the inputs tell."
+        f" noise of its sensor, by {nats:.0f} nats: the model lacks no effect of its inputs."
     )
 
 

@@ -227,7 +227,7 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " that doubles to noise alone, and most held-out samples lose by it"
     ),
     "no_such_voltage": (
-        "no stack bears such a voltage, and what depends on its level cannot be told"
+        "no stack bears such a voltage, and what depends on its level cannot be determined"
     ),
     "other_quantity": "much would remain, and the displacement may be another quantity",
     "held_out_says_little": lambda why: f"{raised(str(why))}: the held-out error says little.",
@@ -309,8 +309,8 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " column (current, charge, a second displacement)."
     ),
     "same_curve": (
-        "{effects: and } bend the same curve: no voltage below the resonances tells one from"
-        " another. Measure the displacement with a second sensor (column displacement_2) or the"
+        "{effects: and } bend the same curve: no voltage below the resonances separates"
+        " them. Measure the displacement with a second sensor (column displacement_2) or the"
         " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
         " or sample fast enough to excite and see the resonances."
     ),
@@ -363,8 +363,8 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     ),
     "hold_found": lambda hold, nats: (
         f"The inputs are {'held' if hold == 'zero' else 'straight lines'} between samples, which"
-        f" explains the records better (ln of the likelihood higher by {nats:.0f}). Nobody said so;"
-        f" if you know better, say --hold {'linear' if hold == 'zero' else 'zero'}."
+        f" explains the records better (ln of the likelihood higher by {nats:.0f}). This is an"
+        f" estimate; if you know better, give --hold {'linear' if hold == 'zero' else 'zero'}."
     ),
     "inputs_smoothed": lambda inputs, nats: (
         f"The readings of {listing(inputs)} are noisy, and the noise is not what drove the device:"

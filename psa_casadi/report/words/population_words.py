@@ -185,7 +185,7 @@ def left_out_sentence(p: population.Population) -> str:
     """Name the parameters that too few devices determine, "" where there are none."""
     if not p.left_out:
         return ""
-    return f"Told by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
+    return f"Determined by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
 
 
 def difference_sentence(

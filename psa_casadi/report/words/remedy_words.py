@@ -206,7 +206,7 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
         return Advice((text,), remarks, commands[:1])
     if d.verdict == "adequate":
         text = (
-            f"Use the model: it errs by {errors} on samples that no fit has seen, at a noise of"
+            f"Use the model: it errs by {errors} on held-out samples, at a noise of"
             f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
             " are untested."
         )

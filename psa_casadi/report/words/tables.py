@@ -271,7 +271,7 @@ def blind_table(d: StackDiagnosis) -> Table:
 def effects_table(effects: Iterable[Component]) -> Table:
     """Return the effects with where they belong and what an engineer sees."""
     rows = [(e.name, e.belongs_to, e.description, e.looks_like) for e in effects]
-    return _table(("effect", "belongs to", "what it is", "what it looks like"), rows)
+    return _table(("effect", "belongs to", "what it is", "expected signature"), rows)
 
 
 def effect_parameter_table(effect: Component) -> Table:

@@ -55,7 +55,7 @@ def story(
     """
     if not isinstance(d, Diagnosis):
         raise InputError(
-            f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
+            f"`story` describes a diagnosis, and this is of type {type(d).__name__}; print it."
         )
     advice = what_now(d, model_file)
     now = [("what now", text) for text in advice.causes]
