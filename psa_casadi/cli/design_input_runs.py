@@ -69,7 +69,7 @@ def track(task: Task, path: targets.Target, minimax: bool) -> None:
     summary = [_follows(result.error), *targets.binding(result.response, task.limits), *how]
     badge = "least largest error" if minimax else "least squares"
     pictures = designs.tracking_pictures(result, plain)
-    _finish(task, "Designed input", summary, rows, pictures, result.response, badge, path=path)
+    _finish(task, "Designed input", summary, rows, pictures, result.response, path, badge)
 
 
 def invert(task: Task, path: targets.Target) -> None:
@@ -82,9 +82,7 @@ def invert(task: Task, path: targets.Target) -> None:
     summary = [_follows(result.error), *targets.binding(result.response, task.limits)]
     summary.append(f"{len(result.trials)} trials on the simulator.")
     pictures = designs.inversion_pictures(result, task.limits)
-    _finish(
-        task, "Inverted input", summary, rows, pictures, result.response, "inversion", path=path
-    )
+    _finish(task, "Inverted input", summary, rows, pictures, result.response, path, "inversion")
 
 
 def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
@@ -99,10 +97,8 @@ def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
         " is worth.",
         *targets.binding(result.response, task.limits),
     ]
-    rows, pictures = ([("the trial, measured", result.error)], designs.trial_pictures(result))
-    _finish(
-        task, "Corrected input", summary, rows, pictures, result.response, "one trial", path=path
-    )
+    rows, pictures = [("the trial, measured", result.error)], designs.trial_pictures(result)
+    _finish(task, "Corrected input", summary, rows, pictures, result.response, path, "one trial")
 
 
 def move(task: Task, ends: tuple[float, float]) -> None:
@@ -165,7 +161,7 @@ def _on_fmu(
 
 def _finish(
     task: Task, title: str, summary: Sequence[str], rows: _Rows, pictures: Sequence[Picture],
-    response: targets.Response, *badges: str, path: targets.Target | None = None,
+    response: targets.Response, path: targets.Target | None = None, badge: str = "",
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
     tables: list[Titled] = [error_table(rows)] if rows else []
@@ -180,7 +176,7 @@ def _finish(
                 live = live_design(task.plant, played, wanted, rest=True)
             designs.write_design_page(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
-                badges=badges, live=live,
+                badges=(badge,) if badge else (), live=live,
             )  # fmt: skip
     show_results(summary, (titled.table for titled in tables))
     show_written(task.output, task.report)

@@ -104,13 +104,9 @@ def diagnose(
             inputs.outputs({**outputs, **others}, [*records, *held, *healthy, model, fitting.fmu])
             if any_model is None:
                 run = _of_stack(
-                    (records, held, healthy),
-                    model,
-                    (stack, stiffness, hysteresis),
-                    reading,
-                    inputs,
+                    inputs, reading, (records, held, healthy), model, stack, stiffness, hysteresis,
                     left_out,
-                )
+                )  # fmt: skip
                 _keep_apart(inputs, output, model)
             else:
                 run = own_diagnosis(
@@ -127,7 +123,7 @@ def diagnose(
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
-            place = next_ or _beside(json or report)
+            place = next_ or next_voltage(json or report)
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
             path = str(output) if output else None
@@ -148,21 +144,21 @@ def _demand_model_name(inputs: Inputs, output: Path | None) -> None:
 
 
 def _of_stack(
+    inputs: Inputs,
+    reading: Reading,
     paths: tuple[Sequence[Path], Sequence[Path], Sequence[Path]],
     model: Path | None,
-    device: tuple[StackName, float | None, Hysteresis],
-    reading: Reading,
-    inputs: Inputs,
+    stack: StackName,
+    stiffness: float | None,
+    hysteresis: Hysteresis,
     left_out: Sequence[str],
 ) -> Callable[..., psa.Diagnosis]:
     """Read the records of a stack; return a function of `progress` and `watch` that diagnoses them.
 
-    `paths` are those to diagnose, to hold out and of the healthy device; `device` are --stack,
-    --stiffness and --hysteresis.
+    `paths` are those to diagnose, to hold out and of the healthy device.
     """
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
-    stack, stiffness, hysteresis = device
     effects = _searched(inputs, left_out)
     inputs.stiffness(stiffness)
     new, held, healthy = paths
@@ -235,6 +231,6 @@ def _show_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched:
         show(line)
 
 
-def _beside(path: Path | None) -> Path | None:
-    """Return where the next voltage goes if no place is named."""
+def next_voltage(path: Path | None) -> Path | None:
+    """Return the file of the next voltage next to a file of the diagnosis."""
     return path.with_name(f"{path.stem}_next.csv") if path is not None else None

@@ -21,7 +21,7 @@ from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
 from psa_casadi.report.plots.figures import Plotted, figure_of, one_output
-from psa_casadi.report.words.phrases import number, percent, plain
+from psa_casadi.report.words.phrases import counted, number, percent, plain
 from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
@@ -69,10 +69,9 @@ def line(result: Plotted | AnyDiagnosisFile) -> str:
     if isinstance(result, Diagnosis | AnyDiagnosisFile):
         return _diagnosis(result)
     if isinstance(result, StackIdentification):
-        count = len(result.experiments)
+        records = counted(len(result.experiments), "record")
         span = max(e.record.range_m for e in result.experiments)
         rest = number(100.0 * result.fit.rms / span, 2)
-        records = f"{count} record{'' if count == 1 else 's'}"
         free = len(result.determinacy.names)
         return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
     if isinstance(result, Identification | Signals):

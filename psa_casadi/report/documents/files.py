@@ -431,53 +431,40 @@ def identification_file(
     identification: Identification, profiles: Iterable[Profile] = ()
 ) -> dict[str, Any]:
     """Return what `--json` writes of an identification, of any model."""
-    intervals = identification.model.provenance.intervals
-    parameters = {
-        p.name: FoundParameter(
-            identification.model.values[p.name],
-            p.unit,
-            (i.low, i.high) if (i := intervals.get(p.name)) is not None else None,
-            grade(identification, p.name).degree,
-            p.description,
-        )
-        for p in identification.model.structure.parameters
-    }
+    model, fit, parameters = identification.model, identification.fit, {}
+    for p in model.structure.parameters:
+        i, degree = model.provenance.intervals.get(p.name), grade(identification, p.name).degree
+        interval = None if i is None else (i.low, i.high)
+        of_p = model.values[p.name], p.unit, interval, degree, p.description
+        parameters[p.name] = FoundParameter(*of_p)
     stack = identification if isinstance(identification, StackIdentification) else None
     records = []
-    for output in identification.fit.channels:
+    for output in fit.channels:
         j, channel = output.number, output.channel
+        if channel.factors:
+            continue
         for k, part in zip(output.records, output.parts, strict=True):
-            if channel.factors:
-                continue
-            e, sigma = identification.experiments[k], identification.fit.sigma[k]
+            e = identification.experiments[k]
             rms = float(np.sqrt(np.mean(part**2))) * e.share(j)
-            if stack is None:
-                sigma = identification.noise[channel.column] * e.share(j)
-            readings = e.measured(j)[e.at(j, e.record.mask)]
-            share = 100.0 * rms / float(np.ptp(readings))
-            records.append(
-                FittedRecord(
-                    e.record.name, e.record.sha256, len(part), rms, float(sigma), share,
-                    channel.column, channel.unit,
-                )
-            )  # fmt: skip
+            sigma = fit.sigma[k] if stack else identification.noise[channel.column] * e.share(j)
+            share = 100.0 * rms / float(np.ptp(e.measured(j)[e.at(j, e.record.mask)]))
+            row = e.record.name, e.record.sha256, len(part), rms, float(sigma), share
+            records.append(FittedRecord(*row, channel.column, channel.unit))
     doubts = [d for d in identification.doubts if isinstance(d, Note) and d.code in _MISSED]
+    advice = stack.advice if stack else ()
     misses = [float(d.values[_MISSED[d.code]]) for d in doubts]
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
-        model=identification.model.name,
+        model=model.name,
         parameters=parameters,
-        rms_m=identification.fit.rms,
-        converged=identification.fit.converged,
+        rms_m=fit.rms,
+        converged=fit.converged,
         interrupted=identification.interrupted,
         records=tuple(records),
         warnings=identification.warnings,
         notes=identification.sentences,
-        advice=tuple(
-            AdvisedRecord(a.sentence, a.parameters, a.repeats)
-            for a in (stack.advice if stack else ())
-        ),
+        advice=tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in advice),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
         missed=max(misses, default=None),
         noise_kinds=identification.noise_kinds,
@@ -544,14 +531,12 @@ class PosteriorFile:
 def posterior_file(posterior: Posterior) -> dict[str, Any]:
     """Return what `--json` writes of a posterior."""
     task = posterior.task
-    records = tuple(
-        SampledRecord(
-            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
-            task.channel(b).column, task.channel(b).unit,
-        )
-        for b in task.density.blocks
-        for e in (task.experiments[b.record],)
-    )  # fmt: skip
+    records = []
+    for b in task.density.blocks:
+        e, channel = task.experiments[b.record], task.channel(b)
+        samples = int(e.at(b.channel).sum())
+        row = e.record.name, e.record.sha256, samples, b.alike, b.level
+        records.append(SampledRecord(*row, channel.column, channel.unit))
     parameters = {
         f.name: SampledParameter(
             f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
@@ -568,7 +553,7 @@ def posterior_file(posterior: Posterior) -> dict[str, Any]:
         draws=posterior.draws,
         seed=posterior.seed,
         divergences=posterior.divergences,
-        records=records,
+        records=tuple(records),
         warnings=posterior.warnings,
         notes=posterior.sentences,
     )

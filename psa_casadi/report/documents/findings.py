@@ -125,15 +125,9 @@ def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
     errors = []
     if isinstance(d, files.DiagnosisFile):
         base, extended = d.base_errors, d.extended_errors
-        errors = [
-            HeldOutErrors(
-                base.holdout_rms_m,
-                extended.holdout_rms_m,
-                d.noise_floor_rms_m,
-                base.holdout_nrmse_percent,
-                extended.holdout_nrmse_percent,
-            )
-        ]
+        rms = base.holdout_rms_m, extended.holdout_rms_m, d.noise_floor_rms_m
+        percents = base.holdout_nrmse_percent, extended.holdout_nrmse_percent
+        errors = [HeldOutErrors(*rms, *percents)]
     elif isinstance(d, files.OwnModelFile):
         errors = [
             HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
@@ -176,23 +170,17 @@ def _identification(i: files.IdentificationFile) -> Finding:
 
 
 def _model(model: Model, traces: bool) -> Finding:
-    origin = model.provenance
-    trace = None
+    origin, trace, parameters = model.provenance, None, {}
+    for p in model.structure.parameters:
+        interval = (i.low, i.high) if (i := origin.intervals.get(p.name)) else None
+        of_p = model.values[p.name], p.unit, interval, p.name in origin.free, p.description
+        parameters[p.name] = Found(*of_p)
     with suppress(PsaError):  # without the model's curve the page has all the rest
         trace = replayed(model) if traces else None
     return Finding(
         device="",
         kind="model",
-        parameters={
-            p.name: Found(
-                model.values[p.name],
-                p.unit,
-                (i.low, i.high) if (i := origin.intervals.get(p.name)) else None,
-                p.name in origin.free,
-                p.description,
-            )
-            for p in model.structure.parameters
-        },
+        parameters=parameters,
         records=origin.identified_from,
         force_scale=origin.force_scale,
         trace=trace,

@@ -22,7 +22,6 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.signals import Hold, Signals
-from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import determined
@@ -143,15 +142,13 @@ def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> Liv
         if d.patch is not None:
             beyond = [p - x for p, x in zip(d.patch.predicted, d.extended, strict=True)]
             text = f"{d.patch.name}, as it was found: it does not follow"
-    records = _fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share)
+    records = _fitted_records(d, d.extended_fit, rows, beyond, share)
     return LiveModel(d.model, module, records, extended=added(d), correction=text)
 
 
 def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveModel:
     """Start to compile the model of an identification for its page; `rows` are its series."""
-    records = _fitted_records(
-        identification.model, identification.fit, identification.experiments, rows
-    )
+    records = _fitted_records(identification, identification.fit, rows)
     return LiveModel(identification.model, begun_module(identification.model), records)
 
 
@@ -195,9 +192,8 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
 
 
 def _fitted_records(
-    model: Model,
+    result: Diagnosis | Identification,
     fit: Fit,
-    experiments: Sequence[Experiment],
     series: Sequence[Series],
     beyond: Sequence[FloatArray] = (),
     share: float = 1.0,
@@ -206,8 +202,8 @@ def _fitted_records(
 
     `share` is what counts of each record's noise where errors are judged.
     """
+    model, experiments, rows = result.model, result.experiments, []
     theta, stack = fit.placed(experiments), is_stack(model)
-    rows = []
     for s in series:
         k, j = s.place
         e, channel = experiments[k], experiments[k].channels[j]

@@ -15,9 +15,7 @@ from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
-from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
-from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
 from psa_casadi.report.plots import findings, records
@@ -110,7 +108,7 @@ def _page(
     return render(
         "diagnosis.html",
         f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
-        **_shared(d.model, series, d.experiments, origin),
+        **_shared(d, series, origin),
         **{**dict.fromkeys(_OF_STACK, ()), **parts},
         d=d,
         added=added(d),
@@ -197,10 +195,7 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
         ],
         "signatures": [s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
         "columns": tables.column_table(d) if d.columns else None,
-        "gained": [
-            f"{phrases.raised(gained)}.",
-            *([verdict_words.OWN_VOLTAGES] if own_voltages else []),
-        ],
+        "gained": [f"{phrases.raised(gained)}.", *([verdict_words.OWN_VOLTAGES] * own_voltages)],
         "blind": tables.blind_table(d),
         "noise": [n.sentence for n in d.noise],
     }
@@ -240,9 +235,7 @@ def fit_page(
         return render(
             "fit.html",
             f"Identification of {'a stack' if stack else plain(identification.model.name)}",
-            **_shared(
-                identification.model, series, identification.experiments, origin, identification
-            ),
+            **_shared(identification, series, origin),
             identification=identification,
             combinations=stack.combinations if stack else (),
             further=stack.advice if stack else (),
@@ -267,8 +260,7 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
     Raises InputError when `path` cannot be written to.
     """
     experiments, name = posterior.task.experiments, plain(posterior.model.name)
-    count = len(experiments)
-    records = f"{count} record{'s' if count > 1 else ''}"
+    records = phrases.counted(len(experiments), "record")
     page = render(
         "posterior.html",
         f"Posterior of {name}",
@@ -284,16 +276,14 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
 
 
 def _shared(
-    model: Model,
-    series: Sequence[Series],
-    experiments: Sequence[Experiment],
-    origin: str,
-    identification: Identification | None = None,
+    result: Diagnosis | Identification, series: Sequence[Series], origin: str
 ) -> dict[str, Any]:
     """Return the parts of all pages of results: the worst record, all records, parameters.
 
-    On the page of a fit, `identification`, the former appears only if no script runs.
+    On the page of a fit the former appears only if no script runs.
     """
+    model = result.model
+    identification = result if isinstance(result, Identification) else None
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
     worst = most_telling(series)
@@ -304,29 +294,26 @@ def _shared(
         records.time_plot(worst, origin, limit),
         f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
     )
-    known = fit_words.determined(
-        model, identification if isinstance(identification, StackIdentification) else None
-    )
+    stack = result if isinstance(result, StackIdentification) else None
+    known = fit_words.determined(model, stack)
     others = [n for n in model.parameter_names if n not in known]
-    count = len(experiments)
     return {
-        "badges": [f"{origin} data", f"{count} record{'s' if count > 1 else ''}"],
+        "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
         "origin": origin,
         "worst": worst,
         "still": record_figure(worst, origin=origin),
         "below": below,
         "parts": [
-            _part(
-                series[k], figures[k], origin, limit, identification or series[k].name != worst.name
-            )
-            for k in sorted(order[:MOST_RECORDS])
+            _part(s, figures[k], origin, limit, identification or s.name != worst.name)
+            for k, s in enumerate(series)
+            if k in order[:MOST_RECORDS]
         ],
         "count": len(series),
         "parameters": {
             name: tables.parameter_table(model, identification, only) if only else None
             for name, only in (("known", known), ("others", others))
         },
-        "used": tables.record_table(experiments, origin),
+        "used": tables.record_table(result.experiments, origin),
     }
 
 
@@ -406,18 +393,17 @@ def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
 
     "spectrum" means the lines that are not the drive's.
     """
-    best: dict[str, tuple[float, Misfit, str]] = {}
+    rows: list[tuple[float, Misfit, str]] = []
     for m in misfits:
-        rows = [(v.name, v.share) for v in m.views if v.significant]
-        rows += [("holds", m.holds.share)] if m.holds and m.holds.significant else []
-        rows.append(("spectrum", m.spectrum.share))
-        for name, share in rows:
-            family = name.removesuffix("_gain").removesuffix("_lag")
-            family = _FAMILIES.get(family, family)
-            if share > WORTH_SAYING and (family not in best or share > best[family][0]):
-                best[family] = (share, m, name)
-    order = sorted(best.values(), key=lambda row: -row[0])
-    return tuple((m, name) for _, m, name in order[:_VIEWS])
+        views = (*m.views, m.holds) if m.holds else m.views
+        rows += [(v.share, m, v.name) for v in views if v.significant]
+        rows.append((m.spectrum.share, m, "spectrum"))
+    best: dict[str, tuple[Misfit, str]] = {}
+    for share, m, name in sorted(rows, key=lambda row: -row[0]):
+        family = name.removesuffix("_gain").removesuffix("_lag")
+        if share > WORTH_SAYING:
+            best.setdefault(_FAMILIES.get(family, family), (m, name))
+    return tuple(best.values())[:_VIEWS]
 
 
 def _compared(d: StackDiagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
@@ -429,18 +415,16 @@ def _compared(d: StackDiagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
 
 def _data_view(d: StackDiagnosis, m: Misfit, name: str) -> Picture | None:
     """Return the picture of one view of a record's residual, None where there is nothing in it."""
-    after, counts = _compared(d, m)
+    extended, counts = _compared(d, m)
     if name == "spectrum":
-        plot = findings.spectrum_view_plot(
-            m.spectrum, after.spectrum if after else None, counts=counts
-        )
+        lines = extended.spectrum if extended else None
+        plot = findings.spectrum_view_plot(m.spectrum, lines, counts=counts)
         return Picture(f"{m.record}: spectrum of the residual", plot)
     before = findings.view_named(m, name)
     if before is None:
         return None
-    plot = findings.view_plot(
-        before, findings.view_named(after, name) if after else None, counts=counts
-    )
+    after = findings.view_named(extended, name) if extended else None
+    plot = findings.view_plot(before, after, counts=counts)
     share = f", {phrases.percent(before.share)} of the excess" if before.significant else ""
     return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
 
@@ -468,12 +452,12 @@ def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None
-    observed = signature(effect)
-    view, note = observed.telling.name, size_sentence(observed)
+    expected = signature(effect)
+    view, note = expected.telling.name, size_sentence(expected)
     if view == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
     caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
-    pictures = [Picture(caption, findings.signature_plot(observed), note), _of_the_data(d, view)]
+    pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
     return {
         "name": plain(name),
         "looks_like": effect.looks_like,

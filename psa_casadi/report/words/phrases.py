@@ -227,6 +227,11 @@ def listing(
     return f"{f'{between} '.join(words[:-1])}{'' if joint[0] == ';' else ' '}{joint} {words[-1]}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as "2 records"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def are(names: Sequence[str], between: str = ", ") -> str:
     """Return names with "is" or "are" behind them."""
     return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
