@@ -24,7 +24,7 @@ def linearize(
     observer: Path | None = None,
     noise: list[str] | None = None,
     step: float = 1e-4,
-    arguments: Inputs,
+    inputs: Inputs,
 ) -> None:
     """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
 
@@ -51,16 +51,14 @@ def linearize(
     """
     from psa_casadi.report.plots.figures import bode_figure, write_figure
 
-    arguments.outputs(
-        {"--output": output, "--figure": figure, "--observer": observer}, [model, fmu]
-    )
-    chosen = own_model(arguments, model, Fitting(fmu=fmu), fitted=False)
+    inputs.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
+    chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
     if chosen is None:
-        chosen = arguments.model_or_stack(model, stack, any_model=True)
-    inputs, states = arguments.numbers("--at", at), arguments.numbers("--state", state)
-    sizes, loop = arguments.numbers("--noise", noise), _parsed(arguments, controller)
-    arguments.check()
-    result = psa.linearize(arguments.ready(chosen), inputs, states=states)
+        chosen = inputs.model_or_stack(model, stack, any_model=True)
+    point, states = inputs.numbers("--at", at), inputs.numbers("--state", state)
+    sizes, loop = inputs.numbers("--noise", noise), _parsed(inputs, controller)
+    inputs.check()
+    result = psa.linearize(inputs.ready(chosen), point, states=states)
     show(repr(result))
     if loop is not None:
         m = psa.margins(result, loop, input=from_, output=to)

@@ -30,7 +30,7 @@ def simulate(
     figure: Path | None = None,
     reading: Reading,
     begin: Start,
-    arguments: Inputs,
+    inputs: Inputs,
 ) -> None:
     """Simulate a model on measured or planned inputs; write every output with its unit.
 
@@ -57,28 +57,28 @@ def simulate(
     """
     from psa_casadi.report.plots.figures import columns_figure, write_figure
 
-    arguments.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
+    inputs.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
     chosen_by = Fitting(fmu=fmu, value=value if imported else None)
-    any_model = partial(own_model, arguments, model, chosen_by, fitted=False)
-    chosen, record = _read(arguments, any_model, model, stack, input_, begin, reading)
-    turns = arguments.turns(begin.history)
-    values = {} if imported else arguments.numbers("--value", value)
-    starts = arguments.numbers("--start", start)
+    any_model = partial(own_model, inputs, model, chosen_by, fitted=False)
+    chosen, record = _read(inputs, any_model, model, stack, input_, begin, reading)
+    turns = inputs.turns(begin.history)
+    values = {} if imported else inputs.numbers("--value", value)
+    starts = inputs.numbers("--start", start)
     if chosen is not None:
-        chosen = arguments.attempt(partial(_changed, chosen, values, starts))
-    chosen, record = arguments.ready(chosen), arguments.ready(record)
+        chosen = inputs.attempt(partial(_changed, chosen, values, starts))
+    chosen, record = inputs.ready(chosen), inputs.ready(record)
     with working("simulating"):
-        inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
+        applied = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):
-            outputs, report = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
+            outputs, report = _of_a_stack(chosen, applied, record, turns, begin, starts, hold)
         else:
-            u = np.column_stack([np.empty((record.n, 0)), *inputs.values()])
+            u = np.column_stack([np.empty((record.n, 0)), *applied.values()])
             x0 = np.array([q.start for q in chosen.structure.states])
             y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
             outputs = dict(zip(chosen.output_names, y.T, strict=True))
             report = _start_values(chosen, starts), ""
-        signals = _as_displayed(chosen, record.time, {**inputs, **outputs})
+        signals = _as_displayed(chosen, record.time, {**applied, **outputs})
         written = with_units(
             {"time": record.time, **signals.columns}, {"time": "s", **signals.units}
         )

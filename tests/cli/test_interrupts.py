@@ -134,7 +134,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
 
 
 @pytest.mark.parametrize(
-    ("name", "word", "told"),
+    ("name", "word", "message"),
     [
         ("diagnose", "screening", "there is no verdict; the best fit so far is the base model"),
         ("diagnose", "writing", "the diagnosis was finished before. Kept: {m}, {j}. Not"),
@@ -144,7 +144,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
     ],
 )
 def test_a_command_says_what_it_kept(
-    name: str, word: str, told: str, record: psa.Record, tmp_path: Path,
+    name: str, word: str, message: str, record: psa.Record, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     for home in ("diagnose", "identify"):
@@ -161,11 +161,11 @@ def test_a_command_says_what_it_kept(
         given += ["--json", j]
     ended = command(*given)
     assert ended.code == 130
-    assert f"Interrupted: {told.format(m=m, j=j, r=r)}" in ended.err
-    assert m.exists() == ("Kept" in told or "best fit" in told)
+    assert f"Interrupted: {message.format(m=m, j=j, r=r)}" in ended.err
+    assert m.exists() == ("Kept" in message or "best fit" in message)
     assert not r.exists()
     if m.exists():
-        cut = "finished" not in told
+        cut = "finished" not in message
         assert psa.load_model(m).provenance.interrupted == cut
 
 

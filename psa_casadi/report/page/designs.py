@@ -21,7 +21,7 @@ from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
-from psa_casadi.report.words.phrases import in_brackets, length_scale, number, plain, prefixed_scale
+from psa_casadi.report.words.phrases import any_scale, in_brackets, number, plain
 from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
@@ -186,7 +186,7 @@ def _responses(
     middle = np.mean(list(responses.values()), axis=0) if several else np.zeros(record.n)
     deviations = {n: y - middle for n, y in responses.items()}
     largest = max(float(np.max(np.abs(y))) for y in deviations.values())
-    scale = length_scale(largest) if unit == "m" else prefixed_scale(largest, unit)
+    scale = any_scale(largest, unit)
     name = output.removeprefix("measured_")
     plot = Panel("time [s]", in_brackets(name, scale.unit), 340)
     for (rival, y), colour in zip(deviations.items(), _COLOURS * len(deviations), strict=False):

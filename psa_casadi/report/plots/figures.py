@@ -356,7 +356,7 @@ def _chosen(output: str | None, there: Collection[str], usual: str) -> str:
 def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: str) -> None:
     """Draw values in their SI unit over time, in a handy one."""
     size = float(np.nanmax(np.abs(values), initial=0.0))
-    scale = phrases.handy_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
+    scale = phrases.any_scale(size, unit)
     label = phrases.in_brackets(name, scale.unit)
     draw(axes, Panel("time [s]", label).line(time, scale.factor * values, name))
 
@@ -395,12 +395,6 @@ def _missed_most(posterior: Posterior) -> Block:
     return max(posterior.task.density.blocks, key=share)
 
 
-def _scale(posterior: Posterior, b: Block, size: float) -> phrases.Scale:
-    """Return the unit for numbers of a block of this size."""
-    unit = posterior.task.channel(b).unit
-    return phrases.length_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
-
-
 def _band(posterior: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the ends of the band that holds 94 % of what is predicted, and the median."""
     draws = posterior.tree[group][column_of(posterior.task, b)].to_numpy()
@@ -427,7 +421,7 @@ def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) 
         middle, name = np.zeros_like(y), posterior.task.channel(block).column
     ends = np.array([np.nanmin(y), np.nanmax(y)])
     size = 3.0 * np.ptp(ends) if is_prior else np.nanmax(np.abs(y - middle))
-    scale = _scale(posterior, block, float(size))
+    scale = phrases.any_scale(float(size), posterior.task.channel(block).unit)
     low, high, measured = (scale.factor * (v - middle) for v in (low, high, y))
     if not is_prior:  # measured comes first in its legend
         axes.plot(time, measured, color=colours.MEASURED, linewidth=0.8, label="measured")

@@ -1,7 +1,6 @@
 """Plots of findings: evidence of effects, views of a residual, signatures, determinacy."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -46,7 +45,7 @@ def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
     """One bar for every effect that was tried, with the share of the excess that it explains.
 
     Named causes come first, with their confidence. Of many, the first and most telling ones where
-    only so many are to be drawn.
+    `most` limits them.
     """
     causes = {c.effect: c.confidence for c in d.causes}
     order = sorted(d.candidates, key=lambda c: c.effect not in causes)  # keeps the others' order
@@ -57,7 +56,7 @@ def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
     fills = [bar_colour(c, set(causes)) for c in rows]
     plot = Panel("evidence [ln units], compressed", height=110 + 30 * len(rows), showlegend=False)
     plot.bars(values, names, "", fills, hoverinfo="skip")
-    # the figures stand to the right of bar and zero, clear of the names
+    # the figures are right of bar and zero, clear of the names
     figures = [f" {round(c.evidence):,}; {_figure(c, d)}" for c in rows]
     ends = [max(v, 0.0) for v in values]
     plot.texts(ends, names, figures, "middle right", cliponaxis=False)
@@ -124,7 +123,6 @@ def signature_plot(signature: Signature) -> Panel:
     scale = phrases.length_scale(largest)
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
-    look: dict[str, Any] = {"line": {"color": colours.EXTENDED, "width": 1.8}}
     if view.name == "spectrum":
         top = float(np.max(mean))
         plot.line(factor * view.x, mean, "difference")
@@ -137,7 +135,8 @@ def signature_plot(signature: Signature) -> Panel:
     on = on[:: max(1, on.size // _BEHIND)]
     behind = factor * signature.coordinate[on], scale.factor * signature.counted[on]
     plot.marks(*behind, "samples", colours.NOISE, 3)
-    return plot.marks(factor * view.x, mean, "binned means", **look)
+    line = {"color": colours.EXTENDED, "width": 1.8}
+    return plot.marks(factor * view.x, mean, "binned means", line=line)
 
 
 def _view_panel(

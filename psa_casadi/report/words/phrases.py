@@ -83,6 +83,11 @@ def prefixed_scale(largest: float, unit: str) -> Scale:
     return Scale("" if unit == "1" else unit, 1.0)
 
 
+def any_scale(largest: float, unit: str) -> Scale:
+    """Return the unit in which a quantity of size `largest` in an SI unit is a handy number."""
+    return handy_scale(largest) if unit == "m" else prefixed_scale(largest, unit or "1")
+
+
 def in_brackets(what: str, unit: str) -> str:
     """Return the label of an axis: the quantity with its unit in brackets, if it has one."""
     return f"{what} [{unit}]" if unit not in ("", "1") else what
