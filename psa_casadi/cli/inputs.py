@@ -113,12 +113,8 @@ class Inputs:
         """Read records of a model that is no stack, each in the units of its file."""
         if not paths:
             return ()
-        read = self.attempt(
-            lambda: psa.read_signals(
-                paths, inputs=model.input_names, outputs=model.output_names,
-                columns=reading.columns, sample_time=reading.sample_time,
-            )
-        )  # fmt: skip
+        read_signals = partial(psa.read_signals, paths, inputs=model.input_names, **vars(reading))
+        read = self.attempt(partial(read_signals, outputs=model.output_names))
         lacks = [f"column '{n}' is missing" for n in model.input_names]
         if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")

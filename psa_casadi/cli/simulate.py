@@ -1,6 +1,5 @@
 """`psa simulate`: what a model does with its inputs."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -60,7 +59,7 @@ def simulate(
     inputs.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
     chosen_by = Fitting(fmu=fmu, value=value if imported else None)
-    any_model = partial(own_model, inputs, model, chosen_by, fitted=False)
+    any_model = own_model(inputs, model, chosen_by, fitted=False)
     chosen, record = _read(inputs, any_model, model, stack, input_, begin, reading)
     turns = inputs.turns(begin.history)
     values = {} if imported else inputs.numbers("--value", value)
@@ -95,7 +94,7 @@ def simulate(
 
 def _read(
     inputs: Inputs,
-    read_any_model: "Callable[[], psa.Model | None]",
+    any_model: "psa.Model | None",
     model: Path | None,
     stack: str | None,
     input_: Path,
@@ -105,25 +104,21 @@ def _read(
     """Return the model and the record of its inputs, `Signals` where it is no stack's."""
     from psa_casadi.identification.experiments import in_units
 
-    chosen = read_any_model()
-    if chosen is not None:
+    if any_model is not None:
         problems = Problems()
         voltage = begin.start_voltage is not None
         inputs.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
-        read = next(iter(inputs.signals(chosen, [input_], reading)), None)
-        signals = read and in_units(chosen, read, problems)
+        read = next(iter(inputs.signals(any_model, [input_], reading)), None)
+        signals = read and in_units(any_model, read, problems)
         for sentence in problems.sentences():
             inputs.add(sentence)
-        return chosen, signals
+        return any_model, signals
     chosen = inputs.model_or_stack(model, stack)
     columns = inputs.columns(reading.columns, [input_])
     record = None
     if columns is not None:
-        record = inputs.attempt(
-            lambda: psa.read_record(
-                input_, need_displacement=False, columns=columns, sample_time=reading.sample_time
-            )
-        )
+        read_record = partial(psa.read_record, input_, need_displacement=False, columns=columns)
+        record = inputs.attempt(partial(read_record, sample_time=reading.sample_time))
     return (chosen if begin.start_voltage is None else inputs.started(chosen, begin)), record
 
 
