@@ -145,20 +145,13 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
         f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
         for s, f in rows[:_SERIES]
     ]
-    return {
-        "errors": [
-            _bars(
-                d,
-                f"{e.output}: error on held-out samples, rms",
-                (e.base, e.extended, e.noise),
-                partial(phrases.with_its_unit, unit=e.unit),
-            )
-            for e in d.errors[:_OUTPUTS]
-        ],
-        "wrong": [[[d.missed.where, *wrong]], []],
-        "most": _EFFECTS,
-        "moved": d.moved,
-    }
+    errors = []
+    for e in d.errors[:_OUTPUTS]:
+        caption = f"{e.output}: error on held-out samples, rms"
+        in_unit = partial(phrases.with_its_unit, unit=e.unit)
+        errors.append(_bars(d, caption, (e.base, e.extended, e.noise), in_unit))
+    wrong = [d.missed.where, *wrong]
+    return {"errors": errors, "wrong": [[wrong], []], "most": _EFFECTS, "moved": d.moved}
 
 
 def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
@@ -168,20 +161,15 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     scale = phrases.scale_of(d.experiments, e.holdout_rms_m)
     reach = phrases.handy_scale(span, counts=scale.unit == "counts").text(span)
     sources = phrases.listing(list(dict.fromkeys(n.source for n in d.noise)))
+    estimated = f" It is estimated from: {sources}." if sources else ""
+    caption = f"Error on held-out samples, rms; the displacement's range is {reach}"
+    rms = e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m
     answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
     gained = verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
     own_voltages = added(d) and not d.gain.held_out_records
     return {
         "stack": True,
-        "errors": [
-            _bars(
-                d,
-                f"Error on held-out samples, rms; the displacement's range is {reach}",
-                (e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m),
-                scale.text,
-                f" It is estimated from: {sources}." if sources else "",
-            )
-        ],
+        "errors": [_bars(d, caption, rms, scale.text, estimated)],
         "answers": [f"{label}: {text}" for label, text in answers if text],
         "wrong": [
             [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
@@ -346,11 +334,8 @@ def _part(
         Picture("Distribution of the residual", records.distribution_plot(s),
                 "Dashed: normal distribution of the same mean and standard deviation."),
     ]  # fmt: skip
-    over_time = Picture(
-        f"{s.title}, and residual: {origin} minus model",
-        records.time_plot(s, origin, limit),
-        f"{noise}{_shaded(s)}",
-    )
+    caption = f"{s.title}, and residual: {origin} minus model"
+    over_time = Picture(caption, records.time_plot(s, origin, limit), f"{noise}{_shaded(s)}")
     return {
         "name": s.name,
         "title": s.title,
@@ -458,11 +443,8 @@ def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
         note += " Counted from the beginning of the hold, in the direction of the last change."
     caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
     pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
-    return {
-        "name": plain(name),
-        "looks_like": effect.looks_like,
-        "pictures": [p for p in pictures if p is not None],
-    }
+    there = [p for p in pictures if p is not None]
+    return {"name": plain(name), "looks_like": effect.looks_like, "pictures": there}
 
 
 def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:

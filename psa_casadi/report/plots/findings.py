@@ -13,18 +13,13 @@ from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.series import bar_colour
 from psa_casadi.units import FloatArray, convert
 
-_DEGREE_COLOURS: dict[Degree, str] = {
-    "determined": colours.EXTENDED,
-    "weak": colours.WEAK,
-    "undetermined": colours.BASE,
-    "on its bound": colours.BOUND,
-    "fixed": colours.NOISE,
-}
+#: The colours of the degrees of determinacy, in their order.
+_DEGREE_COLOURS = (colours.EXTENDED, colours.WEAK, colours.BASE, colours.BOUND, colours.NOISE)
 #: The range of the bars [%]; a figure beyond it has a mark.
 _SHORTEST, _LONGEST = 0.01, 1000.0
 #: Heights of a bar, and of a plot's margins with its axis and legend.
@@ -198,11 +193,11 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     left = 10.0 ** math.floor(math.log10(min([1.0, *percents]) * 0.5))
     right = max([100.0, *percents]) * 15.0
     plot = Panel("relative standard error [%]", height=_MARGINS + _BAR * len(rows))
-    for degree in DEGREES:
+    for degree, colour in zip(DEGREES, _DEGREE_COLOURS, strict=True):
         group = [(g, x) for g, x in zip(fitted, percents, strict=True) if g.degree == degree]
         if group:
             names = [g.name for g, _ in group]
-            plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
+            plot.bars([x for _, x in group], names, degree, colour, width=0.66,
                       hovertemplate="%{y}: %{x:.3g} %<extra></extra>")  # fmt: skip
     inks = [colours.NOISE if g.degree == "fixed" else colours.INK for g in rows]
     figures = [

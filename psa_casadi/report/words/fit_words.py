@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal, get_args
 
 from psa_casadi.identification.determinacy import DETERMINED_WIDTH
@@ -87,12 +88,9 @@ def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:
 def strong_pairs(identification: Identification) -> list[tuple[str, str, float]]:
     """Return the pairs of parameters that are known only together, the strongest first."""
     names, matrix = identification.determinacy.names, identification.determinacy.correlations
-    pairs = [
-        (names[i], names[k], float(matrix[i, k]))
-        for i in range(len(names))
-        for k in range(i + 1, len(names))
-        if abs(matrix[i, k]) >= STRONG_CORRELATION
-    ]
+    places = combinations(range(len(names)), 2)
+    strong = [(i, k) for i, k in places if abs(matrix[i, k]) >= STRONG_CORRELATION]
+    pairs = [(names[i], names[k], float(matrix[i, k])) for i, k in strong]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 

@@ -197,12 +197,9 @@ def share_text(candidate: Candidate, d: Diagnosis) -> str:
     else:
         screened = "" if candidate.fitted else " (screened)"
         alone = f"{percent(candidate.explained_share)}{screened}"
-    if len(d.causes) < 2:
+    if len(d.causes) < 2 or candidate.effect not in {c.effect for c in d.causes}:
         return alone
-    named = {c.effect for c in d.causes}
-    share = next(
-        (c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None
-    )
+    share = next((c for c in d.budget.causes if c.what == candidate.effect), None)
     return alone if share is None else f"{alone}; with others {share.percents[0]} %"
 
 
