@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
+from psa_casadi.cli.failures import Case, judge
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName
 from psa_casadi.cli.screen import show, show_table, show_written, working
@@ -54,7 +54,6 @@ def check(
         psa check stack.fmu --model extended.json
     """
     from psa_casadi.report.documents.files import check_file
-    from psa_casadi.report.documents.junit import check_cases
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
     from psa_casadi.strict_json import json_text
@@ -78,3 +77,16 @@ def check(
         atomic_write(json, json_text(check_file(report)))
         show_written(json)
     judge("check", fmu.name, check_cases(report), junit, began)
+
+
+def check_cases(report: psa.CheckReport) -> list[Case]:
+    """Return every check of an FMU as a test."""
+    from psa_casadi.report.words.tables import check_table
+
+    table, cases = check_table(report), []
+    for r, texts in zip(report.rows, table.rows, strict=True):
+        row = dict(zip(table.head, texts, strict=True))
+        figures = f"found {row['found']}, allowed {row['allowed']}" if "found" in row else ""
+        sentence = ": ".join(filter(None, (figures or row["clause"], row["remark"])))
+        cases.append(Case(row["check"], sentence, "" if r.passed else sentence))
+    return cases

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import kept
+from psa_casadi.cli.failures import Case, kept
 from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
@@ -14,7 +14,6 @@ from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.errors import PsaError
 from psa_casadi.files import atomic_write
 from psa_casadi.records import write_record
-from psa_casadi.report.documents.junit import Case
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
 from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_sentence

@@ -13,13 +13,15 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn, ParamSpec
+from typing import NoReturn, ParamSpec
 
 import typer
 
 from psa_casadi.cache import sweep_rooms
+from psa_casadi.characters import plain
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.screen import print_message
 from psa_casadi.errors import InputError, MachineError, PsaError
@@ -31,9 +33,6 @@ from psa_casadi.files import (
     written,
 )
 from psa_casadi.interruption import Work, interruptible_work
-
-if TYPE_CHECKING:
-    from psa_casadi.report.documents.junit import Case
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -244,10 +243,47 @@ def _error_lines(error: Exception) -> list[str]:
     return [f"Failed: {_refused_by_the_machine(error) or fault}"]
 
 
+@dataclass(frozen=True)
+class Case:
+    """One test: its name, its result, and why it failed, "" where it passed."""
+
+    name: str
+    result: str
+    failure: str = ""
+
+
+def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float) -> str:
+    """Return JUnit XML: one suite of the `command` on its `subject`, which took `seconds`.
+
+    The elements and attributes are those that Jenkins' schema and GitLab's and GitHub's readers
+    share: counts in `testsuites` and `testsuite`, `failure` with a message, `system-out`.
+    """
+    from xml.etree import ElementTree
+
+    counts = {
+        "name": plain(f"psa {command} {subject}"),
+        "tests": str(len(cases)),
+        "failures": str(sum(bool(c.failure) for c in cases)),
+        "errors": "0",
+        "time": f"{seconds:.3f}",
+    }
+    suites = ElementTree.Element("testsuites", counts)
+    suite = ElementTree.SubElement(suites, "testsuite", {**counts, "skipped": "0"})
+    for case in cases:
+        table = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
+        test = ElementTree.SubElement(suite, "testcase", table)
+        if case.failure:
+            failure = {"message": plain(case.failure), "type": "failure"}
+            ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)
+        ElementTree.SubElement(test, "system-out").text = plain(case.result)
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
 def judge(
     command: str,
     subject: str,
-    cases: "Sequence[Case]",
+    cases: Sequence[Case],
     junit: Path | None,
     began: float,
     *,
@@ -257,8 +293,6 @@ def judge(
 
     `began` is the start of the command, of `time.perf_counter`; `show_failures` prints failures.
     """
-    from psa_casadi.report.documents.junit import junit_text
-
     if junit is not None:
         atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
     failures = [case.failure for case in cases if case.failure]

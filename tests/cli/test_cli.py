@@ -20,6 +20,8 @@ import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.cli import screen
 from psa_casadi.cli.app import app
+from psa_casadi.cli.check import check_cases
+from psa_casadi.cli.failures import junit_text
 from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, Course, ProgressLine, show_table, working
 from psa_casadi.datasets import DATASETS
 from psa_casadi.effects import EFFECTS
@@ -32,7 +34,6 @@ from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
 from psa_casadi.records.split import whole
-from psa_casadi.report.documents.junit import check_cases, junit_text
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
 from tests.contract.helpers import command, done

@@ -80,10 +80,8 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
     """Return the main findings, a sentence each."""
     devices = list(dict.fromkeys(o.device for o in p.outliers))
     if devices:
-        named = listing(devices[:_MOST_NAMED])
-        more = f" and {len(devices) - _MOST_NAMED} more" if len(devices) > _MOST_NAMED else ""
-        verb = "stands" if len(devices) == 1 else "stand"
-        first = f"{len(devices)} of {len(p.findings)} devices {verb} out: {named}{more}."
+        verb, named = "stands" if len(devices) == 1 else "stand", listing(devices, most=_MOST_NAMED)
+        first = f"{len(devices)} of {len(p.findings)} devices {verb} out: {named}."
     else:
         first = f"None of {len(p.findings)} devices stands out beyond noise and spread."
     sentences = [first]
@@ -99,11 +97,9 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
             if p.drifting
             else "No parameter drifts over the date beyond noise and spread."
         )
-    if p.causes:
-        c = p.causes[0]
-        sentences.append(
-            f"The most frequent cause is {plain(c.what)}: {c.count} of {c.of} devices."
-        )
+    for c in p.causes[:1]:
+        cause = f"The most frequent cause is {plain(c.what)}"
+        sentences.append(f"{cause}: {c.count} of {c.of} devices.")
     return (*sentences, *missed_sentences(p.findings))
 
 
@@ -188,11 +184,8 @@ def left_out_sentence(p: population.Population) -> str:
     return f"Determined by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
 
 
-def difference_sentence(
-    findings: Sequence[Finding], differences: Sequence[population.Difference] | None = None
-) -> str:
+def difference_sentence(findings: Sequence[Finding], rows: Sequence[population.Difference]) -> str:
     """Say which parameters differ beyond noise, how the verdicts do, and which fits miss."""
-    rows = population.differences(findings) if differences is None else differences
     differing = [d.estimates.name for d in rows if d.differs]
     if not rows:
         sentence = "The files share no parameter that two devices determine."
