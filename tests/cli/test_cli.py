@@ -74,7 +74,7 @@ def test_the_playground_and_a_posterior_take_a_model(
 ) -> None:
     file, played = tmp_path / "model.json", []
     save_model(stack_model("demo"), file)
-    monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
+    monkeypatch.setattr(playground, "write_playground", lambda *inputs: played.append(inputs))
     assert command("web", *way, file, "-o", tmp_path / "p.html").code == 0
     ((path, model),) = played
     assert path == tmp_path / "p.html"
@@ -171,7 +171,7 @@ SOURCE = Path(screen.__file__).parents[1]
 
 
 class Clock:
-    """A clock that stands where it is set."""
+    """A clock that shows the time it is set to."""
 
     now = 0.0
 
@@ -233,7 +233,7 @@ def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> Non
 
 
 def commands(item: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield a command of click, which some versions of typer hold in a room of their own."""
+    """Yield a command of click, which some versions of typer vendor."""
     yield path, item
     for name, inner in getattr(item, "commands", {}).items():
         yield from commands(inner, *path, name)

@@ -1,4 +1,4 @@
-"""What the machine refuses is told as such, with its cause and its cure."""
+"""Messages on what the machine refuses: the cause and the cure."""
 
 import errno
 import os
@@ -91,7 +91,7 @@ def test_temporary_files_of_other_packages_go_too(end: str, tmp_path: Path) -> N
 
 
 def ended_by(error: BaseException) -> tuple[int, str]:
-    """Return the exit code of a command that meets an error, and what it says."""
+    """Return the exit code of a command that meets an error, and its message."""
 
     def command() -> None:
         raise error

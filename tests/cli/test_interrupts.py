@@ -51,7 +51,7 @@ def record() -> psa.Record:
 
 
 def at(word: str) -> Callable[[str], None]:
-    """Return a listener that interrupts where a step of the work begins."""
+    """Return a listener that interrupts where a step of the work starts."""
 
     def listen(step: str) -> None:
         if word in step:
@@ -60,7 +60,7 @@ def at(word: str) -> Callable[[str], None]:
     return listen
 
 
-def cut(*given: object, **options: object) -> None:
+def cut(*inputs: object, **options: object) -> None:
     raise KeyboardInterrupt
 
 
@@ -149,17 +149,17 @@ def test_a_command_says_what_it_kept(
 ) -> None:  # fmt: skip
     for home in ("diagnose", "identify"):
         module = import_module(f"psa_casadi.cli.{home}")
-        monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
+        monkeypatch.setattr(module, "working", lambda *inputs: nullcontext(at(word)))
     if word == "writing":
         finished = diagnosis("cause_named")
         module = import_module("psa_casadi.diagnosis.diagnose")
-        monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
+        monkeypatch.setattr(module, "diagnose", lambda *inputs, **options: finished)
     psa.write_record(tmp_path / "r.csv", record)
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given: list[str | Path] = [name, tmp_path / "r.csv", "-o", m, "--report", r, "--still"]
+    inputs: list[str | Path] = [name, tmp_path / "r.csv", "-o", m, "--report", r, "--still"]
     if name == "diagnose":
-        given += ["--json", j]
-    ended = command(*given)
+        inputs += ["--json", j]
+    ended = command(*inputs)
     assert ended.code == 130
     assert f"Interrupted: {message.format(m=m, j=j, r=r)}" in ended.err
     assert m.exists() == ("Kept" in message or "best fit" in message)

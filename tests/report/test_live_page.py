@@ -49,7 +49,7 @@ def page(case: psa.StackDiagnosis, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
-    """Return the held-out rms [nm] of the first record at other values, the offset found again."""
+    """Return the held-out rms [nm] of the first record at other values, with a new offset."""
     e, fit = d.experiments[0], d.extended_fit
     model = d.model.with_values(values)
     trajectory = psa.simulate_record(
@@ -235,7 +235,7 @@ def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> Non
 def test_a_model_of_ones_own_runs_in_its_page(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every output of a record beside the model, at values that are moved, as Python has them."""
+    """Every output of a record and the model, at other values, as Python has them."""
     record = plants.motor(1, friction=0.0)
     result = psa.identify(own_models.motor(), record, starts=1)
     psa.write_fit_report(result, tmp_path / "page.html")

@@ -32,7 +32,7 @@ def shipped(name: str) -> dict[str, Any]:
 
 
 def valid(name: str, text: str) -> dict[str, Any]:
-    """Return what a JSON text holds, which must be as its shipped schema says."""
+    """Return what a JSON text holds, which must match its shipped schema."""
     content: dict[str, Any] = json.loads(text)
     jsonschema.Draft202012Validator(shipped(name)).validate(content)
     return content

@@ -1,4 +1,4 @@
-"""Every word and curve of pages and stories of results, as they were accepted in `told`.
+"""Every word and curve of pages and stories of results, against the accepted files in `told`.
 
 `python -m tests.report.test_told` accepts the texts as they are now: look at the difference in git.
 """

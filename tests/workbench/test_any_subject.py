@@ -1,4 +1,4 @@
-"""The page on a model of one's own: an FMU, whose records have other columns than a stack's."""
+"""The page on an FMU, whose records have other columns than a stack."""
 
 import base64
 import signal

@@ -30,7 +30,7 @@ SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for
 
 
 class Tab:
-    """A browser's tab, as far as the server sees one; `cookie` is what the door has given."""
+    """A browser's tab, as the server sees it; `cookie` comes from the first page."""
 
     def __init__(self, server: Server) -> None:
         self.server, self.port = server, server.port
