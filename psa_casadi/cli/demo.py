@@ -71,8 +71,8 @@ def demo(
     record = psa.read_record(paths[RECORD], need_excitation=True)
     show("A synthetic record, made by a simulated stack with one effect hidden in it.")
     start = starting_model([record])
-    table = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
-    searched = reversed(screened_with(start, table, laws_of(start, [record], table)))
+    effects = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
+    searched = reversed(screened_with(start, effects, laws_of(start, [record], effects)))
     with (
         working("identifying", IDENTIFY) as progress,
         compiled_ahead(searched, first=[make_compiler_ready]),

@@ -100,8 +100,8 @@ def experiment(
     if chosen is not None:
         inputs.refuse({"--stack": stack, "--low": low, "--high": high, "--current": current})
         records: Sequence[psa.Signals] = inputs.signals(chosen, record or [], reading)
-        table = {c.name: c for c in inputs.effects_of_any_model()}
-        effects = [table.get(n, n) for n in effects]
+        known = {c.name: c for c in inputs.effects_of_any_model()}
+        effects = [known.get(n, n) for n in effects]
     else:
         records = inputs.records(record, reading) if record else []
         effects = _stacks_effects(inputs, effects)
@@ -139,10 +139,10 @@ def _stacks_effects(inputs: Inputs, wanted: Sequence[str]) -> "list[psa.Componen
     """Return the effects of a stack to separate; all mistakes are noted."""
     from psa_casadi.model.own_effects import known_effects
 
-    table = known_effects(inputs.user_effects)
-    for name in [n for n in wanted if n not in table]:
+    known = known_effects(inputs.user_effects)
+    for name in [n for n in wanted if n not in known]:
         inputs.add(f"There is no effect '{name}'; `psa effects` lists them.")
-    return [table[n] for n in wanted if n in table]
+    return [known[n] for n in wanted if n in known]
 
 
 def _limits(

@@ -270,8 +270,8 @@ def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float
     suites = ElementTree.Element("testsuites", counts)
     suite = ElementTree.SubElement(suites, "testsuite", {**counts, "skipped": "0"})
     for case in cases:
-        table = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
-        test = ElementTree.SubElement(suite, "testcase", table)
+        attributes = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
+        test = ElementTree.SubElement(suite, "testcase", attributes)
         if case.failure:
             failure = {"message": plain(case.failure), "type": "failure"}
             ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)

@@ -140,8 +140,8 @@ class ResultFile(Lined):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what this version does not know is left out."""
-        table: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
-        return table
+        content: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
+        return content
 
     def to_json(self) -> str:
         """Return the text of the file."""

@@ -247,9 +247,9 @@ def finding_content(finding: Finding) -> dict[str, Any]:
     row: dict[str, Any] = {"verdict": finding.verdict, "cause": causes}
     row["confidence"] = finding.causes[0].confidence if finding.causes else None
     for e in finding.errors or (None,):
-        output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
+        prefix, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
         for name in ("base", "extended", "noise"):
-            row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
+            row[f"{prefix}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = finding.rms_m, finding.rms_percent
     row["missed [times the noise]"] = finding.missed
     for name, p in finding.parameters.items():

@@ -165,8 +165,8 @@ def write_experiment_page(
     predicted = {r.name: r.predict(record, r.truth) for r in design.rivals}
     units = {o.name: o.unit for r in design.rivals for o in r.model.structure.outputs}
     for k, name in enumerate(design.rivals[0].outputs):
-        table = {n: y[:, k] for n, y in predicted.items()}
-        figures.append(_responses(record, table, name, units[name]))
+        outputs = {n: y[:, k] for n, y in predicted.items()}
+        figures.append(_responses(record, outputs, name, units[name]))
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",

@@ -96,9 +96,9 @@ class _Page:
 
     def scripts(self) -> list[Markup]:
         """Return the scripts that the page runs."""
-        result = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
-        result += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
-        return [Markup(text) for text in result]
+        texts = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
+        texts += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
+        return [Markup(text) for text in texts]
 
     def policy(self) -> Markup:
         """Return the policy: a browser refuses all requests, and all scripts but the page's."""

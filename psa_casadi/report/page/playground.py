@@ -62,7 +62,7 @@ def playground(model: Model | None = None) -> str:
     if not stack.publication.stated and names >= {c.name for c in BASE}:
         others = [name for name in STACKS if name != title]
         stacks += [_stack(stack_model(n), whole, n, STACKS[n].description) for n in others]
-    table = {
+    data = {
         "kind": "playground",
         **live_data(whole, web_module(whole)),
         "stacks": stacks,
@@ -71,7 +71,7 @@ def playground(model: Model | None = None) -> str:
         "band": _BAND,
     }
     badges = ["every effect", "no network"]
-    return render("playground.html", f"Play with {title}", badges, data=table)
+    return render("playground.html", f"Play with {title}", badges, data=data)
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:
@@ -126,10 +126,10 @@ def fmu_figures(model: Model, about: Model) -> dict[str, Any]:
     It is what `about` is: usual sizes by name, the noise of the switches, the span of the
     default experiment [s], a description.
     """
-    table = variable_table(model)
-    states = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
+    variables = variable_table(model)
+    states = [abs(v.nominal or 1.0) for v in variables if v.kind == "state"]
     return {
-        "sizes": {v.name: abs(v.nominal) for v in table if v.kind in _SIZED and v.nominal},
+        "sizes": {v.name: abs(v.nominal) for v in variables if v.kind in _SIZED and v.nominal},
         "scales": switch_scales(model, states),
         "span": default_span(model),
         "description": describe(about),
