@@ -3,7 +3,7 @@
 import base64
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,11 +26,6 @@ from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
-_WORDS: dict[type, Callable[..., str]] = {
-    StackDiagnosis: story,
-    StackIdentification: identification_text,
-    Posterior: posterior_text,
-}
 Reported = Diagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
@@ -106,6 +101,12 @@ def cell(result: Plotted | Model | AnyDiagnosisFile) -> str:
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     if isinstance(result, Signals):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
-    words = next((of(result) for kind, of in _WORDS.items() if isinstance(result, kind)), None)
-    words = words or (line if isinstance(result, Trajectory) else repr)(result)
+    if isinstance(result, StackDiagnosis):
+        words = story(result)
+    elif isinstance(result, StackIdentification):
+        words = identification_text(result)
+    elif isinstance(result, Posterior):
+        words = posterior_text(result)
+    else:
+        words = line(result) if isinstance(result, Trajectory) else repr(result)
     return filled("cell.html", words=words, name=line(result), picture=picture)

@@ -435,8 +435,8 @@ def identification_file(
     for p in model.structure.parameters:
         i, degree = model.provenance.intervals.get(p.name), grade(identification, p.name).degree
         interval = None if i is None else (i.low, i.high)
-        of_p = model.values[p.name], p.unit, interval, degree, p.description
-        parameters[p.name] = FoundParameter(*of_p)
+        fields = model.values[p.name], p.unit, interval, degree, p.description
+        parameters[p.name] = FoundParameter(*fields)
     stack = identification if isinstance(identification, StackIdentification) else None
     records = []
     for output in fit.channels:

@@ -173,8 +173,8 @@ def _model(model: Model, traces: bool) -> Finding:
     origin, trace, parameters = model.provenance, None, {}
     for p in model.structure.parameters:
         interval = (i.low, i.high) if (i := origin.intervals.get(p.name)) else None
-        of_p = model.values[p.name], p.unit, interval, p.name in origin.free, p.description
-        parameters[p.name] = Found(*of_p)
+        fields = model.values[p.name], p.unit, interval, p.name in origin.free, p.description
+        parameters[p.name] = Found(*fields)
     with suppress(PsaError):  # without the model's curve the page has all the rest
         trace = replayed(model) if traces else None
     return Finding(
