@@ -198,7 +198,7 @@ def __getattr__(name: str) -> Any:
 #: Where texts are made, which need no pictures; all else that a result shows is in `report.shown`.
 _TEXTS = {
     "note_text": "psa_casadi.report.words.notes",
-    "told": "psa_casadi.report.words.text",
+    "diagnosis_text": "psa_casadi.report.words.text",
     "sentence_of": "psa_casadi.report.words.advice_words",
     "identification_file": "psa_casadi.report.documents.files",
 }

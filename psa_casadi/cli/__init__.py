@@ -10,7 +10,7 @@ INTERRUPTED = 130
 
 
 def main() -> None:
-    """Run the command line; one that was interrupted does not wait for Python's own tidying up."""
+    """Run the command line; one that was interrupted skips the interpreter's finalisation."""
     try:
         from psa_casadi.cli.app import main as run
 

@@ -9,25 +9,21 @@ from typing import Annotated
 
 import typer
 
-from psa_casadi.cli.batch import batch
+from psa_casadi.cli.batch import batch, compare
 from psa_casadi.cli.check import check
-from psa_casadi.cli.compare import compare
-from psa_casadi.cli.datasets import datasets
 from psa_casadi.cli.demo import demo
 from psa_casadi.cli.design_experiment import experiment
 from psa_casadi.cli.design_input import input_
 from psa_casadi.cli.design_mechanism import mechanism
 from psa_casadi.cli.diagnose import diagnose
-from psa_casadi.cli.effects import effects
-from psa_casadi.cli.examples import examples
 from psa_casadi.cli.export import c, fmu, modelica, ssp
 from psa_casadi.cli.failures import guarded, prepare
 from psa_casadi.cli.identify import identify
 from psa_casadi.cli.linearize import linearize
+from psa_casadi.cli.lists import datasets, effects, examples, stacks
 from psa_casadi.cli.options import command
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
-from psa_casadi.cli.stacks import stacks
 from psa_casadi.cli.web import web
 from psa_casadi.command_line import typed
 from psa_casadi.version import __version__
@@ -63,13 +59,13 @@ def _main(
 
 
 def _add(group: typer.Typer, *functions: Callable[..., None]) -> None:
-    """Add commands; the first sentence stands whole in the list, the example on one line."""
+    """Add commands; the list shows the whole first sentence, the help the example on one line."""
     for function in functions:
-        output, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
+        about, _, example = (inspect.getdoc(function) or "").partition("\n\nExample:\n")
         kinds = [p.annotation for p in inspect.signature(function).parameters.values()]
         group.command(
             function.__name__.strip("_"),
-            short_help=output.partition("\n\n")[0],
+            short_help=about.partition("\n\n")[0],
             epilog=f"\b\nExample: {' '.join(example.split())}" if example else None,
             context_settings={"allow_extra_args": typer.Context in kinds},
         )(command(function))

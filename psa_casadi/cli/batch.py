@@ -1,4 +1,4 @@
-"""`psa batch`: many devices, each identified or diagnosed, results one by one."""
+"""`psa batch` and `psa compare`: many devices, each fitted or diagnosed, and side by side."""
 
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
@@ -8,12 +8,12 @@ from typing import Annotated, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Hysteresis, Reading
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.cli.screen import show, show_results, show_written, working
 
-#: Devices without a result that are told one by one.
+#: Devices without a result that are listed one by one.
 _MOST_TOLD = 10
 
 
@@ -30,7 +30,7 @@ def batch(
     hysteresis: Hysteresis = None,
     reading: Reading,
     fitting: Fitting,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Identify or diagnose many devices, each by itself, on all cores or a cluster.
 
@@ -57,47 +57,83 @@ def batch(
     from psa_casadi.report.words.population_words import missed_sentences
 
     inputs.stiffness(stiffness)
-    item = own_model(inputs, model, fitting)
-    if item is None:
+    any_model = own_model(inputs, model, fitting)
+    if any_model is None:
         inputs.columns(reading.columns)
         inputs.model(model)
     inputs.outputs({"--report": report}, [model])
     jobs = inputs.attempt(lambda: jobs_given(records))
     inputs.check()
-    text = model.read_text(encoding="utf-8-sig") if model and item is None else None
+    text = model.read_text(encoding="utf-8-sig") if model and any_model is None else None
     options = psa.Options(
-        work=work, model=item or text, stiffness=stiffness, hysteresis=hysteresis,
+        work=work, model=any_model or text, stiffness=stiffness, hysteresis=hysteresis,
         columns=reading.columns, sample_time=reading.sample_time,
         modules=tuple(inputs.effects or ()), words=fitting.words,
     )  # fmt: skip
-    result = None
-    with ExitStack() as held, working("batch", inputs.quiet) as progress:
+    whole = None
+    with ExitStack() as held, working("batch") as progress:
         client = held.enter_context(dask_client(dask, workers)) if dask else None
         done = psa.batch(
             jobs or (), output, options=options, executor=client, workers=workers,
             progress=progress,
         )  # fmt: skip
-        with suppress(psa.InputError):  # too few devices tell a parameter
-            result = population(done.findings) if report is not None else None
+        with suppress(psa.InputError):  # too few devices determine a parameter
+            whole = population(done.findings) if report is not None else None
     rows = [(d, (d.device, d.status, " ".join(d.problems))) for d in done.devices]
-    if report is not None and result is not None:
-        psa.write_population(result, report, without=[row for d, row in rows if d.problems])
+    if report is not None and whole is not None:
+        psa.write_population(whole, report, without=[row for d, row in rows if d.problems])
     counts = ", ".join(f"{n} {status}" for status, n in done.counts.items())
     kept = f"; {done.kept} of them were there before" if done.kept else ""
-    show(f"{len(done.devices)} devices: {counts}{kept}.", inputs.quiet)
-    tell_lost([row for d, row in rows if d.status != "done"], done.files[0], inputs.quiet)
+    show(f"{len(done.devices)} devices: {counts}{kept}.")
+    show_lost([row for d, row in rows if d.status != "done"], done.files[0])
     for sentence in missed_sentences(done.findings):
-        show(sentence, inputs.quiet)
-    tell_written(*done.files, report if result else None, quiet=inputs.quiet)
-    if report is not None and result is None:
-        show(f"{report} was not written: fewer than four devices tell a parameter.", inputs.quiet)
+        show(sentence)
+    show_written(*done.files, report if whole else None)
+    if report is not None and whole is None:
+        show(f"{report} was not written: fewer than four devices determine a parameter.")
     if not done.findings:
         raise typer.Exit(1)
 
 
-def tell_lost(lost: Sequence[tuple[str, str, str]], where: Path, quiet: bool) -> None:
+def show_lost(lost: Sequence[tuple[str, str, str]], where: Path) -> None:
     """Name devices without a result: how their work ended, and why; `where` has them all."""
     for device, status, why in lost[:_MOST_TOLD]:
-        show(f"  {device}: {status}: {why}", quiet)
+        show(f"  {device}: {status}: {why}")
     if len(lost) > _MOST_TOLD:
-        show(f"  ... and {len(lost) - _MOST_TOLD} more; {where} has them all.", quiet)
+        show(f"  ... and {len(lost) - _MOST_TOLD} more; {where} has them all.")
+
+
+def compare(files: list[Path], *, output: Path = Path("compare.html"), inputs: Inputs) -> None:
+    """Compare two or more devices side by side, or a population of many; write the page of that.
+
+    A model and a diagnosis of the same records are one device. The page needs no network.
+
+    Options:
+        files: Two files or more of psa diagnose --json, psa identify --json or -o, or folders of
+            devices; or the one folder of results of psa batch.
+        output: HTML page to write.
+
+    Example:
+        psa compare before.json after.json -o compare.html
+    """
+    from psa_casadi.devices.batch import read_results
+    from psa_casadi.population.population import population
+    from psa_casadi.report.words.population_words import population_sentences
+    from psa_casadi.report.words.tables import Table
+
+    tables: tuple[Table, ...] = ()
+    inputs.outputs({"--output": output}, files, page="--output")
+    inputs.check()
+    with working("comparing"):
+        if len(files) == 1 and files[0].is_dir():
+            findings, lost = read_results(files[0], inputs.user_effects)
+            show_lost(lost, output)
+            whole = population(findings)
+            psa.write_population(whole, output, without=lost)
+            texts = population_sentences(whole)
+        else:
+            compared = psa.compare(*files, effects=inputs.user_effects)
+            compared.report(output)
+            texts, tables = (compared.sentence,), compared.tables
+    show_results(texts, tables)
+    show_written(output)

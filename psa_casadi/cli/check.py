@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.failures import Case, judge
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.files import atomic_write
 
 
@@ -28,7 +28,7 @@ def check(
     junit: Path | None = None,
     timeout: Annotated[float, typer.Option(min=0.1, max=1e6)] = 600.0,
     memory: Annotated[int, typer.Option(min=64)] = 4096,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Check an FMU of FMI 2 or 3: description, calls, trajectories; exit code 1 if one fails.
 
@@ -54,7 +54,6 @@ def check(
         psa check stack.fmu --model extended.json
     """
     from psa_casadi.report.documents.files import check_file
-    from psa_casadi.report.documents.junit import check_cases
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
     from psa_casadi.strict_json import json_text
@@ -67,14 +66,27 @@ def check(
     chosen = inputs.model_or_stack(model, stack, any_model=True, needed=False)
     records = inputs.records(record, Reading(columns=columns)) if record else ()
     inputs.check()
-    with working("checking", inputs.quiet):
+    with working("checking"):
         report = psa.check_fmu(
-            fmu, chosen, effects=inputs.own, timeout=timeout, memory=memory << 20,
+            fmu, chosen, effects=inputs.user_effects, timeout=timeout, memory=memory << 20,
             evidence=evidence, records=records, portable=portable, foreign=foreign or None,
         )  # fmt: skip
-    show_table(check_table(report), inputs.quiet)
-    show(f"\n{check_sentence(report)}", inputs.quiet)
+    show_table(check_table(report))
+    show(f"\n{check_sentence(report)}")
     if json is not None:
         atomic_write(json, json_text(check_file(report)))
-        tell_written(json, quiet=inputs.quiet)
+        show_written(json)
     judge("check", fmu.name, check_cases(report), junit, began)
+
+
+def check_cases(report: psa.CheckReport) -> list[Case]:
+    """Return every check of an FMU as a test."""
+    from psa_casadi.report.words.tables import check_table
+
+    table, cases = check_table(report), []
+    for r, texts in zip(report.rows, table.rows, strict=True):
+        row = dict(zip(table.head, texts, strict=True))
+        figures = f"found {row['found']}, allowed {row['allowed']}" if "found" in row else ""
+        sentence = ": ".join(filter(None, (figures or row["clause"], row["remark"])))
+        cases.append(Case(row["check"], sentence, "" if r.passed else sentence))
+    return cases

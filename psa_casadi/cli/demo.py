@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
-from psa_casadi.cli.screen import show, show_table, width, working
-from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY
+from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, show, show_table, width, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write, make_folder
 
@@ -25,7 +24,7 @@ FILES = {
     "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
 }
 _ORIGIN = "synthetic"
-#: What its plant has, which no step of the demonstration is told.
+#: The effect of its plant, which no step of the demonstration knows.
 HIDDEN = (
     "Hidden in the record: slow creep by 2.0 % of the elongation for each decade of time, from"
     " 0.08 s on, without end."
@@ -68,18 +67,18 @@ def demo(
     from psa_casadi.simulation.side_by_side import compiled_ahead
     from psa_casadi.simulation.stepper import make_ready
 
-    directory, paths = _prepared(directory, output)
+    directory, paths = _prepared(Inputs(quiet=quiet), directory, output)
     record = psa.read_record(paths[RECORD], need_excitation=True)
-    show("A synthetic record, made by a simulated stack with one effect hidden in it.", quiet)
+    show("A synthetic record, made by a simulated stack with one effect hidden in it.")
     start = starting_model([record])
-    table = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
-    searched = reversed(screened_with(start, table, laws_of(start, [record], table)))
+    effects = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
+    searched = reversed(screened_with(start, effects, laws_of(start, [record], effects)))
     with (
-        working("identifying", quiet, IDENTIFY) as progress,
+        working("identifying", IDENTIFY) as progress,
         compiled_ahead(searched, first=[make_compiler_ready]),
     ):
         psa.save_model(identify([record], progress=progress).model, paths["model.json"])
-    with ThreadPoolExecutor(1) as others, working("diagnosing", quiet, DIAGNOSE) as progress:
+    with ThreadPoolExecutor(1) as others, working("diagnosing", DIAGNOSE) as progress:
         d = diagnose([record], progress=progress)
         exported = others.submit(psa.export_fmu, d.model, paths["extended.fmu"])
         others.submit(make_ready, d.model.plant())  # the check simulates with it
@@ -89,25 +88,27 @@ def demo(
         psa.write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
         psa.save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
     text = psa.story(d, origin=_ORIGIN, width=width(), model_file=extended)
-    show(f"\n{text}\n\n{HIDDEN}\n", quiet)
-    with working("exporting and checking the FMU", quiet):
+    show(f"\n{text}\n\n{HIDDEN}\n")
+    with working("exporting and checking the FMU"):
         exported.result()
         checked = psa.check_fmu(paths["extended.fmu"], d.model)
-    show_table(check_table(checked), quiet)
+    show_table(check_table(checked))
     files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
-    show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}", quiet)
+    show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}")
     if not checked.passed:
         raise typer.Exit(1)
-    show(NEXT.format(report=paths["report.html"]), quiet)
+    show(NEXT.format(report=paths["report.html"]))
 
 
-def _prepared(named: Path | None, output: Path | None) -> tuple[Path, dict[str, Path]]:
+def _prepared(
+    inputs: Inputs, named: Path | None, output: Path | None
+) -> tuple[Path, dict[str, Path]]:
     """Create the directory, check that every file can be written, copy the record to it."""
     if named is not None and output is not None:
         raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
     directory = named or output or Path("psa_demo")
     make_folder(directory)
-    paths, inputs = {name: directory / name for name in FILES}, Given()
+    paths = {name: directory / name for name in FILES}
     inputs.outputs(paths, [])
     inputs.check()
     packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")

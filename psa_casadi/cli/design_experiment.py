@@ -1,4 +1,4 @@
-"""`psa design experiment`: the next record to measure, for parameters or to tell effects apart."""
+"""`psa design experiment`: the next record to measure, for parameters or to separate effects."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.errors import InputError
 
-#: Samples of a record where no number is given.
+#: Samples of a record by default.
 _SAMPLES = 1000
 
 
@@ -47,7 +47,7 @@ def experiment(
     still: bool = False,
     reading: Reading,
     fitting: Fitting,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
 
@@ -97,38 +97,27 @@ def experiment(
         "rate": rate, "current": current, "bandwidth": bandwidth,
     }  # fmt: skip
     effects: Sequence[Any] = [*dict.fromkeys([*(separate or []), *(more or [])])]
-    records: Sequence[psa.Signals]
     if chosen is not None:
-        stacks_own = ("low", "high", "current")
-        inputs.refuse({"--stack": stack, **{f"--{n}": wanted[n] for n in stacks_own}})
-        records = inputs.signals(chosen, record or [], reading)
-        table = {c.name: c for c in inputs.of_any_model()}
-        effects = [table.get(n, n) for n in effects]
+        inputs.refuse({"--stack": stack, "--low": low, "--high": high, "--current": current})
+        records: Sequence[psa.Signals] = inputs.signals(chosen, record or [], reading)
+        known = {c.name: c for c in inputs.effects_of_any_model()}
+        effects = [known.get(n, n) for n in effects]
     else:
         records = inputs.records(record, reading) if record else []
         effects = _stacks_effects(inputs, effects)
         chosen = inputs.model_or_stack(model, stack)
-    for wrong, sentence in (
-        (
-            len(effects) == 1,
-            "One effect alone cannot be separated from anything; name two effects or more.",
-        ),
-        (
-            effects and parameter,
-            "--separate and --parameter are both given; design one record for each.",
-        ),
-        (
-            not 0.0 <= correlation < 1.0,
-            f"--correlation is {correlation:g}; give a number from 0 to below 1.",
-        ),
-        (starts < 1, f"--starts is {starts}; give 1 or more."),
-    ):
-        if wrong:
-            inputs.add(sentence)
+    if len(effects) == 1:
+        inputs.add("One effect alone cannot be separated from anything; name two effects or more.")
+    if effects and parameter:
+        inputs.add("--separate and --parameter are both given; design one record for each.")
+    if not 0.0 <= correlation < 1.0:
+        inputs.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
+    if starts < 1:
+        inputs.add(f"--starts is {starts}; give 1 or more.")
     limits = inputs.attempt(lambda: _limits(chosen, records, input_ or [], wanted))
     level = inputs.attempt(lambda: _noise(chosen, noise or []))
     chosen, limits = inputs.ready(chosen), inputs.ready(limits)
-    with working("designing an experiment", inputs.quiet) as progress:
+    with working("designing an experiment") as progress:
         design = design_experiment(
             chosen, limits, records=records, separate=effects, parameters=parameter or [],
             optimality=optimality, noise=level, correlation=correlation,
@@ -139,22 +128,21 @@ def experiment(
             psa.write_record(output, columns_to_play(design))
         if report is not None:
             _write_page(report, design, chosen, still)
-    for sentence in sentences(design):
-        show(sentence, inputs.quiet)
-    for displayed in design_tables(design):
-        show(f"\n{displayed.title}\n", inputs.quiet)
-        show_table(displayed.table, inputs.quiet)
-    tell_written(output, report, quiet=inputs.quiet)
+    show("\n".join(sentences(design)))
+    for titled in design_tables(design):
+        show(f"\n{titled.title}\n")
+        show_table(titled.table)
+    show_written(output, report)
 
 
-def _stacks_effects(inputs: Given, wanted: Sequence[str]) -> "list[psa.Component]":
+def _stacks_effects(inputs: Inputs, wanted: Sequence[str]) -> "list[psa.Component]":
     """Return the effects of a stack to separate; all mistakes are noted."""
     from psa_casadi.model.own_effects import known_effects
 
-    table = known_effects(inputs.own)
-    for name in [n for n in wanted if n not in table]:
+    known = known_effects(inputs.user_effects)
+    for name in [n for n in wanted if n not in known]:
         inputs.add(f"There is no effect '{name}'; `psa effects` lists them.")
-    return [table[n] for n in wanted if n in table]
+    return [known[n] for n in wanted if n in known]
 
 
 def _limits(
@@ -163,24 +151,24 @@ def _limits(
     inputs: Sequence[str],
     wanted: Mapping[str, float | None],
 ) -> "dict[str, psa.design.Limits]":
-    """Return the limits: as given, else those of a stack's records, else its rated voltage."""
+    """Return the limits: by the options, else of a stack's records, else its rated voltage."""
     from psa_casadi.design.experiment.limits import Limits, limits_of
     from psa_casadi.simulation.start import is_stack
 
     if model is None:
         return {}
-    statement = {k: v for k, v in wanted.items() if v is not None}
+    given_limits = {k: v for k, v in wanted.items() if v is not None}
     if is_stack(model) and records:
         return {"voltage": limits_of(records, **wanted)}
-    if "duration" not in statement:
+    if "duration" not in given_limits:
         raise InputError("No length is given; add --duration SECONDS, or --record with records.")
-    samples = int(statement.pop("samples", _SAMPLES))
+    samples = int(given_limits.pop("samples", _SAMPLES))
     if is_stack(model):
-        statement = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **statement}
-        if not statement["high"]:
+        given_limits = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **given_limits}
+        if not given_limits["high"]:
             raise InputError("The model has no rated voltage; add --high VOLTS.")
-        return {"voltage": Limits(samples=samples, **statement)}
-    table = {}
+        return {"voltage": Limits(samples=samples, **given_limits)}
+    limits = {}
     for text in inputs:
         name, _, figures = text.partition("=")
         try:
@@ -189,17 +177,17 @@ def _limits(
             raise InputError(
                 f"--input is '{text}'; give NAME=LOW:HIGH, such as {model.input_names[0]}=0:10."
             ) from None
-        item = {**statement, "rate": steepest[0]} if steepest else statement
-        table[name] = Limits(low=low, high=high, samples=samples, **item)
-    if not table:
+        settings = {**given_limits, "rate": steepest[0]} if steepest else given_limits
+        limits[name] = Limits(low=low, high=high, samples=samples, **settings)
+    if not limits:
         raise InputError(
             f"No input may move; add --input NAME=LOW:HIGH, of {', '.join(model.input_names)}."
         )
-    return table
+    return limits
 
 
 def _noise(model: "psa.Model | None", texts: Sequence[str]) -> dict[str, float] | float | None:
-    """Return the noise of every output as given: that of a stack in nm, else in its unit."""
+    """Return the noise of every output by the option: of a stack in nm, else in its unit."""
     values: dict[str, float] = {}
     for text in texts:
         name, _, figure = text.rpartition("=")

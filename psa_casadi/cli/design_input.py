@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName
 
 
@@ -23,7 +23,7 @@ def input_(
     report: Path | None = None,
     check_fmu: bool = True,
     still: bool = False,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Design the voltage for a path or for a quickest move; test it on simulator and FMU.
 
@@ -67,7 +67,7 @@ def input_(
     trial = inputs.records([measured], Reading()) if measured is not None else []
     chosen = inputs.model_or_stack(model, stack)
     plant, limits = inputs.ready(chosen).plant(), inputs.ready(limits)
-    task = runs.Task(plant, limits, output, report, still, check_fmu, inputs.quiet)
+    task = runs.Task(plant, limits, output, report, still, check_fmu)
     if move is not None:
         runs.move(task, move)
     elif path is not None and trial:

@@ -9,7 +9,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.screen import show_results, tell_written, working
+from psa_casadi.cli.screen import show_results, show_written, working
 from psa_casadi.design.tracking import targets
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
@@ -36,12 +36,11 @@ class Task:
     report: Path | None
     still: bool
     check_fmu: bool
-    quiet: bool
 
 
 def track(task: Task, path: targets.Target, minimax: bool) -> None:
     """Design the voltage for a path."""
-    with working("designing", task.quiet) as progress:
+    with working("designing") as progress:
         result = tracked(task.plant, path, task.limits, minimax=minimax, progress=progress)
         plain = targets.uncompensated(task.plant, path).displacement
         rows: _Rows = [("designed, full simulator", result.error)]
@@ -70,12 +69,12 @@ def track(task: Task, path: targets.Target, minimax: bool) -> None:
     summary = [_follows(result.error), *targets.binding(result.response, task.limits), *how]
     badge = "least largest error" if minimax else "least squares"
     pictures = designs.tracking_pictures(result, plain)
-    _finish(task, "Designed input", summary, rows, pictures, result.response, badge, path=path)
+    _finish(task, "Designed input", summary, rows, pictures, result.response, path, badge)
 
 
 def invert(task: Task, path: targets.Target) -> None:
     """Invert the model along a path; the limits cut the voltage."""
-    with working("inverting", task.quiet) as progress:
+    with working("inverting") as progress:
         result = inverted(task.plant, path, task.limits)
         rows: _Rows = [("inversion, full simulator", result.error)]
         for reached in _on_fmu(task, result.response, progress):
@@ -83,14 +82,12 @@ def invert(task: Task, path: targets.Target) -> None:
     summary = [_follows(result.error), *targets.binding(result.response, task.limits)]
     summary.append(f"{len(result.trials)} trials on the simulator.")
     pictures = designs.inversion_pictures(result, task.limits)
-    _finish(
-        task, "Inverted input", summary, rows, pictures, result.response, "inversion", path=path
-    )
+    _finish(task, "Inverted input", summary, rows, pictures, result.response, path, "inversion")
 
 
 def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     """Correct the voltage of a trial by what it showed."""
-    with working("correcting", task.quiet):
+    with working("correcting"):
         result = corrected(task.plant, path, trial, task.limits)
     change = float(np.max(np.abs(result.response.voltage - result.played)))
     summary = [
@@ -100,25 +97,13 @@ def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
         " is worth.",
         *targets.binding(result.response, task.limits),
     ]
-    rows, pictures = (
-        [("the trial, measured", result.error)],
-        designs.trial_pictures(result),
-    )
-    _finish(
-        task,
-        "Corrected input",
-        summary,
-        rows,
-        pictures,
-        result.response,
-        "one trial",
-        path=path,
-    )
+    rows, pictures = [("the trial, measured", result.error)], designs.trial_pictures(result)
+    _finish(task, "Corrected input", summary, rows, pictures, result.response, path, "one trial")
 
 
 def move(task: Task, ends: tuple[float, float]) -> None:
     """Design a quickest move between two positions [um]."""
-    with working("designing", task.quiet) as progress:
+    with working("designing") as progress:
         begin, end = (1e-6 * position for position in ends)
         quick = quickest_move(task.plant, begin, end, task.limits, progress=progress)
         summary = [
@@ -176,7 +161,7 @@ def _on_fmu(
 
 def _finish(
     task: Task, title: str, summary: Sequence[str], rows: _Rows, pictures: Sequence[Picture],
-    response: targets.Response, *badges: str, path: targets.Target | None = None,
+    response: targets.Response, path: targets.Target | None = None, badge: str = "",
 ) -> None:  # fmt: skip
     """Write CSV and page, show sentences and tables."""
     tables: list[Titled] = [error_table(rows)] if rows else []
@@ -191,7 +176,7 @@ def _finish(
                 live = live_design(task.plant, played, wanted, rest=True)
             designs.write_design_page(
                 task.report, title=title, summary=summary, tables=tables, figures=pictures,
-                badges=badges, live=live,
+                badges=(badge,) if badge else (), live=live,
             )  # fmt: skip
-    show_results(summary, (titled.table for titled in tables), task.quiet)
-    tell_written(task.output, task.report, quiet=task.quiet)
+    show_results(summary, (titled.table for titled in tables))
+    show_written(task.output, task.report)

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.screen import show_results, tell_written, working
+from psa_casadi.cli.screen import show_results, show_written, working
 from psa_casadi.errors import InputError
 
 
@@ -28,7 +28,7 @@ def mechanism(
     port: Path | None = None,
     report: Path | None = None,
     still: bool = False,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.
 
@@ -69,7 +69,7 @@ def mechanism(
     if wanted is not None:
         inputs.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
     chosen, goals = inputs.ready(chosen), inputs.ready(wanted)
-    with working("designing", inputs.quiet) as progress:
+    with working("designing") as progress:
         progress(f"{starts} starts")
         design = psa.design_mechanism(
             chosen, damping=damping, bandwidth=bandwidth, poles=goals, limits=limits,
@@ -81,23 +81,23 @@ def mechanism(
     if report is not None:
         write_mechanism_page(design, report, chosen, still=still)
     tables = mechanism_table(design), pole_table(design)
-    show_results(mechanism_sentences(design), tables, inputs.quiet)
-    tell_written(output, port, report, quiet=inputs.quiet)
+    show_results(mechanism_sentences(design), tables)
+    show_written(output, port, report)
 
 
 def _poles(text: str | None) -> tuple[complex, ...]:
     """Read poles in rad/s, such as -4e4+4e4j,-4e4-4e4j."""
-    items = []
+    poles = []
     for part in (text or "").split(","):
         if not part.strip():
             continue
         try:
-            items.append(complex(part.replace(" ", "").replace("i", "j")))
+            poles.append(complex(part.replace(" ", "").replace("i", "j")))
         except ValueError as error:
             raise InputError(
                 f"--poles: '{part.strip()}' is no pole; write -4e4+4e4j,-4e4-4e4j in rad/s."
             ) from error
-    return tuple(items)
+    return tuple(poles)
 
 
 def _share(text: str) -> float:

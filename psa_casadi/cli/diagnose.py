@@ -11,11 +11,18 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import judge
-from psa_casadi.cli.inputs import Given, meant
+from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
-from psa_casadi.cli.screen import show, show_table, tell_written, width, working
-from psa_casadi.cli.steps import DIAGNOSE, events_to
+from psa_casadi.cli.screen import (
+    DIAGNOSE,
+    events_to,
+    show,
+    show_table,
+    show_written,
+    width,
+    working,
+)
 
 
 def diagnose(
@@ -43,7 +50,7 @@ def diagnose(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
@@ -85,7 +92,7 @@ def diagnose(
     }  # fmt: skip
     began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
     healthy = reference or []
-    item = own_model(inputs, model, fitting)
+    any_model = own_model(inputs, model, fitting)
     with timed() as spent:
         with stage("loading"):
             from psa_casadi.cli import diagnosis_files as files
@@ -93,21 +100,17 @@ def diagnose(
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
             _demand_model_name(inputs, output)
-            table = {"--next": next_, "--events": events, "--junit": junit}
-            inputs.outputs({**outputs, **table}, [*records, *held, *healthy, model, fitting.fmu])
-            if item is None:
+            others = {"--next": next_, "--events": events, "--junit": junit}
+            inputs.outputs({**outputs, **others}, [*records, *held, *healthy, model, fitting.fmu])
+            if any_model is None:
                 run = _of_stack(
-                    (records, held, healthy),
-                    model,
-                    (stack, stiffness, hysteresis),
-                    reading,
-                    inputs,
+                    inputs, reading, (records, held, healthy), model, stack, stiffness, hysteresis,
                     left_out,
-                )
+                )  # fmt: skip
                 _keep_apart(inputs, output, model)
             else:
                 run = own_diagnosis(
-                    item, records, held, fitting, reading, inputs, leave_out=left_out,
+                    any_model, records, held, fitting, reading, inputs, leave_out=left_out,
                     others={
                         "--reference": healthy, "--next": next_, "--stack": stack,
                         "--stiffness": stiffness, "--hysteresis": hysteresis,
@@ -115,58 +118,56 @@ def diagnose(
                 )  # fmt: skip
             wanted = files.expected(inputs, expect, max_error)
             inputs.check()
-        with working("diagnosing", inputs.quiet, DIAGNOSE) as progress, events_to(events) as watch:
+        with working("diagnosing", DIAGNOSE) as progress, events_to(events) as watch:
             try:
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
                 raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
-            place = next_ or _beside(json or report)
+            place = next_ or next_voltage(json or report)
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
             path = str(output) if output else None
             text = psa.story(d, origin=origin, width=width(), model_file=path)
-    show(text, inputs.quiet)
-    _tell_files(d, outputs, unpatched, inputs.quiet)
+    show(text)
+    _show_files(d, outputs, unpatched)
     if timings:
-        show("", inputs.quiet)
-        show_table(timings_table(spent.stages), inputs.quiet)
-        show(
-            f"\nprocessor time with the start of Python: {clock.process_time():.2f} s", inputs.quiet
-        )
+        show("")
+        show_table(timings_table(spent.stages))
+        show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s")
     subject = ", ".join(p.name for p in records)
-    judge("diagnose", subject, files.cases(d, *wanted), junit, began, tells=True)
+    judge("diagnose", subject, files.cases(d, *wanted), junit, began, show_failures=True)
 
 
-def _demand_model_name(inputs: Given, output: Path | None) -> None:
+def _demand_model_name(inputs: Inputs, output: Path | None) -> None:
     if output is not None and output.suffix.lower() in (".fmu", ".ssp", ".ssv"):
         inputs.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
 
 
 def _of_stack(
+    inputs: Inputs,
+    reading: Reading,
     paths: tuple[Sequence[Path], Sequence[Path], Sequence[Path]],
     model: Path | None,
-    device: tuple[StackName, float | None, Hysteresis],
-    reading: Reading,
-    inputs: Given,
+    stack: StackName,
+    stiffness: float | None,
+    hysteresis: Hysteresis,
     left_out: Sequence[str],
 ) -> Callable[..., psa.Diagnosis]:
-    """Read the records of a stack; return what diagnoses them, given `progress` and `watch`.
+    """Read the records of a stack; return a function of `progress` and `watch` that diagnoses them.
 
-    `paths` are those to diagnose, to hold out and of the healthy device; `device` are --stack,
-    --stiffness and --hysteresis.
+    `paths` are those to diagnose, to hold out and of the healthy device.
     """
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
-    stack, stiffness, hysteresis = device
-    table = _searched(inputs, left_out)
+    effects = _searched(inputs, left_out)
     inputs.stiffness(stiffness)
     new, held, healthy = paths
-    result = inputs.records([*new, *healthy], reading, held)
+    read = inputs.records([*new, *healthy], reading, held)
     first, last = len(new), inputs.fitted
     start = inputs.model_or_stack(model, stack, needed=False)
     return partial(
-        run, result[:first], reference=result[first:last], holdout=result[last:], model=start,
-        stiffness=stiffness, hysteresis=hysteresis, effects=table,
+        run, read[:first], reference=read[first:last], holdout=read[last:], model=start,
+        stiffness=stiffness, hysteresis=hysteresis, effects=effects,
     )  # fmt: skip
 
 
@@ -179,7 +180,7 @@ def _finish(
 ) -> tuple[psa.Diagnosis, str]:
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
-    `page` says what the page calls the records, and whether it is still.
+    `page` is the origin of the records, and whether the page is still.
     """
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
@@ -198,19 +199,19 @@ def _finish(
         raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
 
 
-def _keep_apart(inputs: Given, output: Path | None, model: Path | None) -> None:
-    """Demand that no model written beside the output is the one that is read."""
+def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None:
+    """Demand that no model written next to the output is the one that is read."""
     if output is None or model is None or model.resolve().parent != output.resolve().parent:
         return
     if fnmatch(model.name, f"{output.stem}_*_for_*.json"):
         inputs.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
 
 
-def _searched(inputs: Given, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
+def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
     """Return the effects to search, without those that --leave-out names."""
     from psa_casadi.model.own_effects import known_effects
 
-    known = known_effects(inputs.own)
+    known = known_effects(inputs.user_effects)
     for name in dict.fromkeys(n for n in left_out if n not in known):
         inputs.add(
             f"--leave-out: there is no effect '{name}'; {meant(name, known)}`psa effects` lists"
@@ -219,19 +220,17 @@ def _searched(inputs: Given, left_out: Sequence[str]) -> "tuple[psa.Component, .
     return tuple(c for n, c in known.items() if n not in left_out)
 
 
-def _tell_files(
-    d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str, quiet: bool
-) -> None:
+def _show_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 
-    items = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
+    written = [None if o == "--patch" and unpatched else p for o, p in outputs.items()]
     following = d.next_experiment.voltage_csv if isinstance(d, psa.StackDiagnosis) else None
-    tell_written(*items, following, quiet=quiet)
+    show_written(*written, following)
     for line in [*files.models(d, outputs["--output"]), *([unpatched] if unpatched else [])]:
-        show(line, quiet)
+        show(line)
 
 
-def _beside(path: Path | None) -> Path | None:
-    """Return where the next voltage goes if no place is named."""
+def next_voltage(path: Path | None) -> Path | None:
+    """Return the file of the next voltage next to a file of the diagnosis."""
     return path.with_name(f"{path.stem}_next.csv") if path is not None else None

@@ -6,22 +6,21 @@ from dataclasses import replace
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import kept
-from psa_casadi.cli.inputs import Given, meant
+from psa_casadi.cli.failures import Case, kept
+from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.errors import PsaError
 from psa_casadi.files import atomic_write
 from psa_casadi.records import write_record
-from psa_casadi.report.documents.junit import Case
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
 from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_sentence
 
 
 def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
-    """Return the models with another cause, each with its file beside the extended model's."""
+    """Return the models with another cause, each with its file next to the extended model's."""
     if output is None or not isinstance(d, result.StackDiagnosis):
         return []
     return [
@@ -39,11 +38,9 @@ def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
 
 
 def models(d: result.Diagnosis, output: Path | None) -> list[str]:
-    """Say what the model's file holds if nothing was added, and which files are beside it."""
-    lines = [
-        f"written: {path}, with {a.instead} instead of {a.cause}"
-        for a, path in alternatives(d, output)
-    ]
+    """Say what the model's file holds if nothing was added, and which files are next to it."""
+    others = alternatives(d, output)
+    lines = [f"written: {path}, with {a.instead} instead of {a.cause}" for a, path in others]
     if output is not None and not added(d):
         lines.append(f"nothing was added: {output} holds the base model")
     return lines
@@ -76,7 +73,7 @@ def write(
     *,
     still: bool = False,
 ) -> None:
-    """Write what was asked for, each file whole or not at all, and add it to what is `written`."""
+    """Write the wanted files, each whole or not at all, and add them to the `written` ones."""
     extended = None if outputs["--output"] is None else str(outputs["--output"])
     writers: dict[str, Callable[[Path], None]] = {
         "--output": lambda path: psa.save_model(d.model, path),
@@ -101,8 +98,8 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    output, same = one_of_each(d.contenders, d.experiments)
-    if same and len(output) < 2:
+    contenders, same = one_of_each(d.contenders, d.experiments)
+    if same and len(contenders) < 2:
         return d
     before = d.next_experiment
     try:
@@ -111,7 +108,7 @@ def with_next(
         reasons = (*before.reasons, f"No record could be designed: {error}")
         return replace(d, next_experiment=replace(before, reasons=reasons))
     each = sentences(design)
-    if design.plays is None:  # not worth a record; the last sentence is what an amplifier needs
+    if design.plays is None:  # it would not decide; the last sentence is what an amplifier needs
         reasons = (*before.reasons, *each[:-1], *same)
         return replace(d, next_experiment=replace(before, reasons=reasons))
     write_record(path, experiment.columns_to_play(design))
@@ -133,7 +130,7 @@ def write_patch(d: result.Diagnosis, path: Path | None, progress: Callable[[str]
 
 
 def expected(
-    inputs: Given, verdicts: str | None, max_error: str | None
+    inputs: Inputs, verdicts: str | None, max_error: str | None
 ) -> tuple[tuple[str, ...], float | None]:
     """Return the verdicts of which one must come out, and the largest held-out error [%]."""
     words = [re.sub(r"[\s-]+", "_", w.strip().lower()) for w in (verdicts or "").split(",")]
@@ -143,8 +140,8 @@ def expected(
     for word in wanted:
         if word not in VERDICTS:
             inputs.add(f"--expect: '{word}' is no verdict; {meant(word, VERDICTS)}{there}")
-    matches = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
-    largest = float(matches[1]) if matches else 0.0
+    percentage = re.fullmatch(r"\s*(\d+\.?\d*|\.\d+)\s*%\s*", max_error or "")
+    largest = float(percentage[1]) if percentage else 0.0
     if max_error is not None and not largest > 0.0:
         inputs.add(
             f"--max-error is '{max_error}'; give a positive percentage of the range, as 0.5%."

@@ -11,13 +11,13 @@ from typing import Annotated, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given, step_seconds
+from psa_casadi.cli.inputs import Inputs, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, show_table, tell_written, working
+from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.files import atomic_write, make_folder
 
-#: The stack of a system for which no model is given.
+#: The stack of a system without a model.
 DEFAULT_STACK = "P-885.51"
 
 
@@ -35,7 +35,7 @@ def c(
     include_sensor: bool = False,
     start: Start,
     published: Published,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a model as C99 for a controller: a step of fixed length and constant cost.
 
@@ -63,44 +63,42 @@ def c(
         chosen = inputs.attempt(lambda: psa.part_for(part, base, period=seconds))
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     period = inputs.ready(seconds)
-    with working("generating", inputs.quiet) as progress:
+    with working("generating") as progress:
         progress("compiling and comparing")
         code_export = psa.export_c(
             chosen, output, step=period, precision=precision, name=name,
             include_sensor=include_sensor, hold=hold, substeps=substeps,
         )  # fmt: skip
-    _show_inside(chosen, include_sensor, inputs.quiet)
+    _show_inside(chosen, include_sensor)
     for note in chosen.provenance.notes if part else ():
-        show(note, inputs.quiet)
+        show(note)
     errors = {e.voltage: e.error for e in code_export.errors}
-    _show_step(
-        f"{period:g} s", code_export.substeps, precision, errors, code_export.limit, inputs.quiet
-    )
-    tell_written(code_export.header, code_export.source, quiet=inputs.quiet)
+    _show_step(f"{period:g} s", code_export.substeps, precision, errors, code_export.limit)
+    show_written(code_export.header, code_export.source)
 
 
-def _show_inside(model: "psa.Model", include_sensor: bool, quiet: bool) -> "psa.Model":
+def _show_inside(model: "psa.Model", include_sensor: bool) -> "psa.Model":
     """Print which components an export holds, and which it leaves out; return what it holds."""
     kept = model if include_sensor else model.plant()
-    show(f"inside: {', '.join(c.name for c in kept.components)}", quiet)
+    show(f"inside: {', '.join(c.name for c in kept.components)}")
     left_out = [c.name for c in model.components if c not in kept.components]
     if left_out:
-        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)", quiet)
+        show(f"left out: {', '.join(left_out)} (--include-sensor keeps them)")
     return kept
 
 
 def _show_step(
-    step: str, substeps: int, precision: str, errors: Mapping[str, float], limit: float, quiet: bool
+    step: str, substeps: int, precision: str, errors: Mapping[str, float], limit: float
 ) -> None:
     """Print what a fixed step is, its error by reference voltage, and up to where it holds."""
     from psa_casadi.export.fixed_step.code import limit_words
     from psa_casadi.report.words.tables import Table
 
     each = "1 substep" if substeps == 1 else f"{substeps} substeps"
-    show(f"step: {step}, {each}, {precision} precision", quiet)
+    show(f"step: {step}, {each}, {precision} precision")
     rows = tuple((voltage, f"{error:.1e}") for voltage, error in errors.items())
-    show_table(Table(("voltage", "largest error over the range"), rows), quiet)
-    show(limit_words(limit), quiet)
+    show_table(Table(("voltage", "largest error over the range"), rows))
+    show(limit_words(limit))
 
 
 def fmu(
@@ -120,7 +118,7 @@ def fmu(
     validity_output: bool = False,
     start: Start,
     published: Published,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a model as an FMU: FMI 2.0 or 3.0, co-simulation and model exchange in one archive.
 
@@ -163,38 +161,35 @@ def fmu(
     targets = inputs.ready(targets)
     if chosen.structure.foreign:
         psa.export_extended(chosen, output)
-        tell_written(output, quiet=inputs.quiet)
+        show_written(output)
         return
-    with working("compiling", inputs.quiet) as progress:
+    with working("compiling") as progress:
         progress(", ".join(t.name for t in targets))
         psa.export_fmu(
             chosen, output, name=name, include_sensor=include_sensor, platforms=wanted,
             fmi=int(fmi), parameter_sets=parameter_sets, validity_output=validity_output,
             step=seconds,
         )  # fmt: skip
-    kept = _show_inside(chosen, include_sensor, inputs.quiet)
+    kept = _show_inside(chosen, include_sensor)
     sets = set_files(kept, parameter_sets)
     if sets_to is not None and sets:
         make_folder(sets_to)
         for place, text in sets.items():
             atomic_write(sets_to / place.rpartition("/")[2], text)
-    show(f"platforms: {', '.join(t.name for t in targets)}", inputs.quiet)
-    show(f"start: {_start_words(kept)}", inputs.quiet)
+    show(f"platforms: {', '.join(t.name for t in targets)}")
+    show(f"start: {_start_words(kept)}")
     if seconds is None:
-        show(f"evidence: {_evidence_words(kept, len(sets))}", inputs.quiet)
+        show(f"evidence: {_evidence_words(kept, len(sets))}")
     else:
         fixed = json.loads(zipfile.Path(output, FIXED_ENTRY).read_bytes())
         limit = fixed.get("voltage_limit", math.inf)
-        _show_step(
-            f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit, inputs.quiet
-        )
+        _show_step(f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit)
     if not has_zig():
         show(
             "The binary is by this machine's compiler, for systems like this one; after"
-            f" `{INSTALL_ZIG}` it loads on older ones too.",
-            inputs.quiet,
+            f" `{INSTALL_ZIG}` it loads on older ones too."
         )
-    tell_written(output, quiet=inputs.quiet)
+    show_written(output)
 
 
 def _evidence_words(model: "psa.Model", sets: int) -> str:
@@ -229,7 +224,7 @@ def modelica(
     include_sensor: bool = False,
     start: Start,
     published: Published,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a model as a Modelica package: signals, connectors, examples in one file.
 
@@ -246,9 +241,9 @@ def modelica(
     chosen = inputs.model_or_stack(model, stack, part=part, any_model=True)
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
-    kept = _show_inside(chosen, include_sensor, inputs.quiet)
-    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}", inputs.quiet)
-    tell_written(output, quiet=inputs.quiet)
+    kept = _show_inside(chosen, include_sensor)
+    show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}")
+    show_written(output)
 
 
 def ssp(
@@ -262,7 +257,7 @@ def ssp(
     picture: Path | None = None,
     platforms: str = "host",
     published: Published,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired.
 
@@ -286,12 +281,12 @@ def ssp(
         inputs.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     inputs.attempt(lambda: chosen_platforms(wanted))
-    result = own_model(inputs, model, Fitting())
-    if result is not None and result.structure.foreign:
+    any_model = own_model(inputs, model, Fitting())
+    if any_model is not None and any_model.structure.foreign:
         inputs.refuse({"--picture": picture, "--stack": stack, "--no-compensator": no_compensator})
         inputs.check()
-        psa.export_extended(result, output, platforms=wanted)
-        tell_written(output, quiet=inputs.quiet)
+        psa.export_extended(any_model, output, platforms=wanted)
+        show_written(output)
         return
     chosen = inputs.model_or_stack(model, stack or (DEFAULT_STACK if model is None else None))
     chosen = inputs.published(chosen, published)
@@ -300,21 +295,21 @@ def ssp(
         made = partial(psa.nanopositioner, chosen, compensated=not no_compensator)
         system = inputs.attempt(made)
     chosen, system = inputs.ready(chosen), inputs.ready(system)
-    with working("compiling", inputs.quiet) as progress:
+    with working("compiling") as progress:
         progress(", ".join(system.parts))
         psa.export_ssp(system, output, platforms=wanted, publication=chosen.publication)
     wiring = wiring_of(system)
     if picture is not None:
         save_wiring(wiring, layout_of(wiring), picture)
-    show(f"parts: {', '.join(system.parts)}", inputs.quiet)
+    show(f"parts: {', '.join(system.parts)}")
     for kind in ("input", "output"):
-        ports = [n for n, result in wiring.ports(OUTSIDE) if result == kind]
+        ports = [n for n, direction in wiring.ports(OUTSIDE) if direction == kind]
         named = (f"{n} [{wiring.unit(Port(OUTSIDE, n))}]" for n in ports)
-        show(f"{kind}s: {', '.join(named)}", inputs.quiet)
+        show(f"{kind}s: {', '.join(named)}")
     if not inputs.quiet:
         held, sloped = (1e6 * stable_step(wiring, rates=rates) for rates in (False, True))
         show(
             f"communication step: unstable above {held:.3g} us with inputs held over a step, above"
             f" {sloped:.3g} us with input derivatives"
         )
-    tell_written(output, picture, quiet=inputs.quiet)
+    show_written(output, picture)

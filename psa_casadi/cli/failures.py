@@ -13,15 +13,17 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, NoReturn, ParamSpec
+from typing import NoReturn, ParamSpec
 
 import typer
 
 from psa_casadi.cache import sweep_rooms
+from psa_casadi.characters import plain
 from psa_casadi.cli import INTERRUPTED
-from psa_casadi.cli.screen import tell
+from psa_casadi.cli.screen import print_message
 from psa_casadi.errors import InputError, MachineError, PsaError
 from psa_casadi.files import (
     abandon,
@@ -31,9 +33,6 @@ from psa_casadi.files import (
     written,
 )
 from psa_casadi.interruption import Work, interruptible_work
-
-if TYPE_CHECKING:
-    from psa_casadi.report.documents.junit import Case
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -128,7 +127,7 @@ def prepare() -> None:
     """Give a command streams that can be written to, and an end that leaves nothing behind.
 
     All temporary files, those of other packages and programs too, lie in a folder of ours. Where
-    none can be made, the first to need one says so.
+    none can be made, the first to need one fails.
     """
     for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
@@ -150,23 +149,23 @@ def prepare() -> None:
 
 def _refused_by_the_machine(error: Exception) -> str | None:
     """Return what the machine refused and what to do; None where the error is not of this kind."""
-    statement = str(error)
-    if isinstance(error, MemoryError) or any(word in statement for word in _MEMORY):
+    message = str(error)
+    if isinstance(error, MemoryError) or any(word in message for word in _MEMORY):
         return (
             "there is too little memory; close other programs, raise the limit (ulimit -v), or give"
             " fewer or shorter records."
         )
-    if isinstance(error, OSError) and "No usable temporary directory" in statement:
+    if isinstance(error, OSError) and "No usable temporary directory" in message:
         return "there is no folder for temporary files; set TMPDIR to one that may be written to."
     if isinstance(error, OSError) and error.errno in _REFUSALS:
         what, cure = _REFUSALS[error.errno]
         where = f" ({error.filename})" if error.filename else ""
         return f"{what}{where}; {cure}."
-    if isinstance(error, RuntimeError) and "can't start new thread" in statement:
+    if isinstance(error, RuntimeError) and "can't start new thread" in message:
         return "no more threads may be started; close other programs, or raise the limit."
     if isinstance(error, ImportError) and not (error.name or "").startswith("psa_casadi"):
         return (
-            f"the installation is not complete ({statement}); install psa_casadi again with what it"
+            f"the installation is not complete ({message}); install psa_casadi again with what it"
             " needs."
         )
     return None
@@ -176,17 +175,15 @@ P = ParamSpec("P")
 
 #: Set in the environment, this variable lets a failure end with its traceback.
 DEBUG = "PSA_CASADI_DEBUG"
-#: What is told where the folder that the command runs in was removed.
-NOWHERE = "The folder that this runs in is not there any more; change to another one, as by `cd`."
-#: What is told of an interrupt before there was any result.
-NOTHING_KEPT = "there was no result yet, so nothing was kept."
+#: The message if the folder that the command runs in was removed.
+_NOWHERE = "The folder that this runs in is not there any more; change to another one, as by `cd`."
 
 
 def guarded(command: Callable[P, None]) -> Callable[P, None]:
-    """Return the command with its errors told in sentences, without a traceback.
+    """Return the command with its errors as sentences, without a traceback.
 
     Exit code 2: what the user gave cannot be used; every mistake is listed. Exit code 1: a failure
-    that is not the user's. 130: interrupted; what was kept is told.
+    that is not the user's. 130: interrupted; the message names what was kept.
     """
 
     @functools.wraps(command)
@@ -205,16 +202,17 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(1) from error
         except KeyboardInterrupt as stop:
             there = ", ".join(dict.fromkeys(str(p) for p in written()[before:]))
-            output = str(stop) or (f"written before: {there}." if there else NOTHING_KEPT)
-            tell(f"Interrupted: {output}")
+            none = "there was no result yet, so nothing was kept."
+            kept_files = f"written before: {there}." if there else none
+            print_message(f"Interrupted: {str(stop) or kept_files}")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             if os.environ.get(DEBUG):
                 raise
-            told_of = InputError(NOWHERE) if _is_nowhere(error) else error
-            for line in _told(told_of):
-                tell(line)
-            raise typer.Exit(2 if isinstance(told_of, InputError) else 1) from error
+            cause = InputError(_NOWHERE) if _is_nowhere(error) else error
+            for line in _error_lines(cause):
+                print_message(line)
+            raise typer.Exit(2 if isinstance(cause, InputError) else 1) from error
 
     return run
 
@@ -228,8 +226,8 @@ def _is_nowhere(error: Exception) -> bool:
     return False
 
 
-def _told(error: Exception) -> list[str]:
-    """Return what is said of an error."""
+def _error_lines(error: Exception) -> list[str]:
+    """Return the message of an error."""
     if isinstance(error, InputError):
         if len(error.problems) == 1:
             return [f"Error: {error.problems[0]}"]
@@ -245,25 +243,60 @@ def _told(error: Exception) -> list[str]:
     return [f"Failed: {_refused_by_the_machine(error) or fault}"]
 
 
+@dataclass(frozen=True)
+class Case:
+    """One test: its name, its result, and why it failed, "" where it passed."""
+
+    name: str
+    result: str
+    failure: str = ""
+
+
+def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float) -> str:
+    """Return JUnit XML: one suite of the `command` on its `subject`, which took `seconds`.
+
+    The elements and attributes are those that Jenkins' schema and GitLab's and GitHub's readers
+    share: counts in `testsuites` and `testsuite`, `failure` with a message, `system-out`.
+    """
+    from xml.etree import ElementTree
+
+    counts = {
+        "name": plain(f"psa {command} {subject}"),
+        "tests": str(len(cases)),
+        "failures": str(sum(bool(c.failure) for c in cases)),
+        "errors": "0",
+        "time": f"{seconds:.3f}",
+    }
+    suites = ElementTree.Element("testsuites", counts)
+    suite = ElementTree.SubElement(suites, "testsuite", {**counts, "skipped": "0"})
+    for case in cases:
+        attributes = {"classname": plain(f"psa.{command}.{subject}"), "name": plain(case.name)}
+        test = ElementTree.SubElement(suite, "testcase", attributes)
+        if case.failure:
+            failure = {"message": plain(case.failure), "type": "failure"}
+            ElementTree.SubElement(test, "failure", failure).text = plain(case.failure)
+        ElementTree.SubElement(test, "system-out").text = plain(case.result)
+    ElementTree.indent(suites)
+    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
 def judge(
     command: str,
     subject: str,
-    cases: "Sequence[Case]",
+    cases: Sequence[Case],
     junit: Path | None,
     began: float,
     *,
-    tells: bool = False,
+    show_failures: bool = False,
 ) -> None:
-    """Write what was found of a subject as tests, if a file is named; end with 1 if one failed.
+    """Write the checks of a subject as JUnit tests, if a file is named; end with 1 if one failed.
 
-    `began` is when the command did, of `time.perf_counter`; with `tells` each failure is told.
+    `began` is the start of the command, of `time.perf_counter`; `show_failures` prints failures.
     """
-    from psa_casadi.report.documents.junit import junit_text
-
     if junit is not None:
         atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
     failures = [case.failure for case in cases if case.failure]
-    for failure in failures if tells else ():
-        tell(f"Not as expected: {failure}")
+    for failure in failures if show_failures else ():
+        print_message(f"Not as expected: {failure}")
     if failures:
         raise typer.Exit(1)

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Literal
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell, tell_written, width, working
-from psa_casadi.cli.steps import IDENTIFY
+from psa_casadi.cli.screen import IDENTIFY, print_message, show, show_written, width, working
 from psa_casadi.files import atomic_write
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def identify(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine.
 
@@ -59,15 +58,15 @@ def identify(
     from psa_casadi.report.words.advice_words import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
-    item = own_model(inputs, model, fitting)
+    any_model = own_model(inputs, model, fitting)
     outputs = {"--output": output, "--json": json, "--report": report}
     inputs.outputs(outputs, [*records, model, fitting.fmu])
-    if item is not None:
+    if any_model is not None:
         of_stacks = {"--stack": stack, "--stiffness": stiffness, "--hysteresis": hysteresis}
         inputs.refuse({**of_stacks, "--method": method == "paper", "--profile": profile})
-        signals = inputs.signals(item, records, reading)
+        signals = inputs.signals(any_model, records, reading)
         work: Callable[..., psa.Identification] = partial(
-            psa.identify, item, signals, **fitting.words
+            psa.identify, any_model, signals, **fitting.words
         )
     else:
         inputs.stiffness(stiffness)
@@ -81,38 +80,33 @@ def identify(
                 of_stack, measured, model=start, stiffness=stiffness, hysteresis=hysteresis
             )
     inputs.check()
-    with working("identifying", inputs.quiet, IDENTIFY) as progress:
+    with working("identifying", IDENTIFY) as progress:
         result = work(progress=progress)
         profiles = _finish(result, outputs, profile or (), (origin, still), progress)
     text = repr(result)
     if isinstance(result, StackIdentification):
         text = identification_text(result, origin=origin, width=width())
-    show(text, inputs.quiet)
-    for found_profile in profiles:
-        show("\n" + "\n".join(profile_sentences(found_profile)), inputs.quiet)
+    show(text)
+    for likelihood in profiles:
+        show("\n" + "\n".join(profile_sentences(likelihood)))
     if left_out := [n for n in profile or () if n not in result.determinacy.names]:
         show(
             f"\nNo profile of {', '.join(left_out)}: not searched in this fit; the parameters"
-            f" searched are {', '.join(result.determinacy.names)}.",
-            inputs.quiet,
+            f" searched are {', '.join(result.determinacy.names)}."
         )
-    tell_written(*outputs.values(), quiet=inputs.quiet)
+    show_written(*outputs.values())
 
 
 def _refuse_beside_paper(
-    inputs: Given, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
+    inputs: Inputs, starts: tuple[object, object], hysteresis: str | None, profile: list[str] | None
 ) -> None:
     """Note the options that the paper's method does not take."""
-    for wrong, sentence in (
-        (profile, "has no likelihood; leave --profile or --method out."),
-        (starts != (None, None), "starts from no model; leave --model, --stack or --method out."),
-        (
-            hysteresis not in (None, "bouc-wen"),
-            "finds Bouc-Wen parameters; leave --hysteresis or --method out.",
-        ),
-    ):
-        if wrong:
-            inputs.add(f"--method paper {sentence}")
+    if profile:
+        inputs.add("--method paper has no likelihood; leave --profile or --method out.")
+    if starts != (None, None):
+        inputs.add("--method paper starts from no model; leave --model, --stack or --method out.")
+    if hysteresis not in (None, "bouc-wen"):
+        inputs.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
 
 
 def _save(model: psa.Model, output: Path) -> None:
@@ -120,8 +114,8 @@ def _save(model: psa.Model, output: Path) -> None:
     if output.suffix.lower() not in (".fmu", ".ssv"):
         psa.save_model(model, output)
         return
-    for statement in psa.save_start_values(model, output):
-        tell(f"Note: {statement}")
+    for sentence in psa.save_start_values(model, output):
+        print_message(f"Note: {sentence}")
 
 
 def _finish(
@@ -131,9 +125,9 @@ def _finish(
     page: tuple[str, bool],
     progress: Callable[[str], None],
 ) -> "list[Profile]":
-    """Write the files and return the profiles; at an interrupt the model is kept, which it says.
+    """Write the files and return the profiles; an interrupt keeps the model and names it.
 
-    `page` says what the page calls the records, and whether it is still.
+    `page` is the origin of the records, and whether the page is still.
     """
     from psa_casadi.identification.profile import profile
     from psa_casadi.report.documents.files import identification_file
@@ -145,15 +139,9 @@ def _finish(
         if output is not None:
             _save(identification.model, output)
             done.append(output)
-        names = [
-            n
-            for n in wanted
-            if n in identification.determinacy.names and not identification.interrupted
-        ]
-        profiles = [
-            profile(identification.fit, identification.experiments, n, progress=progress)
-            for n in names
-        ]
+        names = () if identification.interrupted else identification.determinacy.names
+        fit, experiments = identification.fit, identification.experiments
+        profiles = [profile(fit, experiments, n, progress=progress) for n in wanted if n in names]
         if json is not None:
             atomic_write(json, json_text(identification_file(identification, profiles)))
             done.append(json)

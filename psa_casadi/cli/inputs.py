@@ -1,4 +1,4 @@
-"""What a command is given, checked as a whole before any long work starts."""
+"""The inputs of a command, checked as a whole before any long work starts."""
 
 import difflib
 import os
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import psa_casadi as psa
 from psa_casadi.cli.options import Published, Reading, Start
-from psa_casadi.cli.screen import tell
+from psa_casadi.cli.screen import print_message, set_quiet
 from psa_casadi.errors import InputError
 from psa_casadi.files import why_not_written
 
@@ -24,11 +24,11 @@ _PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".p
 
 
 @dataclass(kw_only=True)
-class Given:
-    """Collects the problems of everything that a command is given, to tell them all at once.
+class Inputs:
+    """The inputs of a command: collects their problems, to report all of them at once.
 
-    Unless `quiet`, what the reader took a record's columns for is told. `own` are the effects of
-    the modules that --effects names, `fitted` is the number of records that are not held out.
+    Unless `quiet`, it prints how the reader understood a record's columns. `user_effects` are those
+    of the modules that --effects names, `fitted` is the number of records that are not held out.
     """
 
     effects: list[str] | None = None
@@ -38,20 +38,21 @@ class Given:
 
     def __post_init__(self) -> None:
         """Read the effects."""
-        self.own: list[psa.Component] = []
+        set_quiet(self.quiet)
+        self.user_effects: list[psa.Component] = []
         self._misfits: list[str] = []
         if not self.effects:
             return
         from psa_casadi.model.own_effects import declared_effects, misfits
 
         read = [self.attempt(partial(declared_effects, module)) for module in self.effects]
-        self.own = [c for result in read for c in (result or {}).values()]
-        self._misfits = misfits(self.own)
+        self.user_effects = [c for result in read for c in (result or {}).values()]
+        self._misfits = misfits(self.user_effects)
 
-    def of_any_model(self) -> list[psa.Component]:
-        """Return the own effects for a model of one's own: beside a stack they need not fit."""
+    def effects_of_any_model(self) -> list[psa.Component]:
+        """Return the user's effects for a model that is no stack, which they need not fit."""
         self._misfits = []
-        return self.own
+        return self.user_effects
 
     def add(self, sentence: str) -> None:
         """Note one problem."""
@@ -78,7 +79,7 @@ class Given:
     def records(
         self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()
     ) -> "list[psa.Record]":
-        """Read records to fit, `fitted` of them, then those held out; none may be given twice.
+        """Read records to fit, `fitted` of them, then those held out; none may come twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. Nothing is
         read where --columns is not understood.
@@ -103,30 +104,26 @@ class Given:
                 records.append(record)
                 self.fitted += fitted
                 for note in () if self.quiet else record.notes:
-                    tell(f"Note: {note}")
+                    print_message(f"Note: {note}")
         return records
 
     def signals(
         self, model: "psa.Model", paths: Sequence[Path], reading: Reading
     ) -> "tuple[psa.Signals, ...]":
-        """Read records of a model of one's own, each in the units of its file."""
+        """Read records of a model that is no stack, each in the units of its file."""
         if not paths:
             return ()
-        result = self.attempt(
-            lambda: psa.read_signals(
-                paths, inputs=model.input_names, outputs=model.output_names,
-                columns=reading.columns, sample_time=reading.sample_time,
-            )
-        )  # fmt: skip
+        read_signals = partial(psa.read_signals, paths, inputs=model.input_names, **vars(reading))
+        read = self.attempt(partial(read_signals, outputs=model.output_names))
         lacks = [f"column '{n}' is missing" for n in model.input_names]
         if model.structure.foreign and any(q in p for q in lacks for p in self._problems):
             self.add("An input of the FMU that no record has is held by --value NAME=VALUE.")
-        for note in [n for s in result or () for n in s.notes if not self.quiet]:
-            tell(f"Note: {note}")
-        return result or ()
+        for note in [n for s in read or () for n in s.notes if not self.quiet]:
+            print_message(f"Note: {note}")
+        return read or ()
 
     def refuse(self, others: Mapping[str, object]) -> None:
-        """Refuse the options that a model of one's own does not take, of those that are given."""
+        """Refuse the options with a value, which a model that is no stack does not take."""
         for option in [name for name, value in others.items() if value]:
             self.add(f"{option} is not there for a model of your own; leave it out.")
 
@@ -142,7 +139,7 @@ class Given:
         return values
 
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
-        """Return what --columns says, nothing where it is left out; None where it is wrong.
+        """Return the map of --columns, an empty one without it; None where it is wrong.
 
         A file that it names must be one of the `paths`, where these are known.
         """
@@ -160,7 +157,7 @@ class Given:
 
         if path is None:
             return None
-        model = self.attempt(lambda: psa.load_model(path, self.own))
+        model = self.attempt(lambda: psa.load_model(path, self.user_effects))
         if model is None:
             return None
         if not is_stack(model):
@@ -186,10 +183,10 @@ class Given:
         With `any_model` the file need not hold a stack.
         """
         options = {"--model": path, "--stack": stack, "--part": part}
-        items = [name for name, value in options.items() if value is not None]
-        if len(items) > 1:
-            all_of_them = "both" if len(items) == 2 else "all"
-            self.add(f"{' and '.join(items)} are {all_of_them} given; leave one of them out.")
+        named = [name for name, value in options.items() if value is not None]
+        if len(named) > 1:
+            all_of_them = "both" if len(named) == 2 else "all"
+            self.add(f"{' and '.join(named)} are {all_of_them} given; leave one of them out.")
             return None
         if part is not None:
             return self.attempt(lambda: psa.part_model(part))
@@ -202,11 +199,11 @@ class Given:
                 )
             return None
         if any_model:
-            return self.attempt(lambda: psa.load_model(path, self.own))
+            return self.attempt(lambda: psa.load_model(path, self.user_effects))
         return self.model(path)
 
     def turns(self, history: str | None) -> tuple[float, ...]:
-        """Return the voltages [V] of a history; none where it is not given."""
+        """Return the voltages [V] of a history; none without one."""
         try:
             return tuple(float(part) for part in history.split(",")) if history is not None else ()
         except ValueError:
@@ -227,17 +224,17 @@ class Given:
         )
 
     def published(self, model: "psa.Model | None", published: Published) -> "psa.Model | None":
-        """Return a model that states what the options say, else what it stated before."""
-        table = {name: text for name, text in asdict(published).items() if text is not None}
-        for name, text in table.items():
+        """Return a model with the statements of the options, else its former ones."""
+        statements = {name: text for name, text in asdict(published).items() if text is not None}
+        for name, text in statements.items():
             if not text.strip() or not text.isprintable():
                 self.add(f"--{name} is {text!r}; give a text of one line, or leave it out.")
         if model is None:
             return None
-        return replace(model, publication=replace(model.publication, **table))
+        return replace(model, publication=replace(model.publication, **statements))
 
     def stiffness(self, value: float | None) -> None:
-        """Demand a positive stiffness, if one is given."""
+        """Demand a positive stiffness, if there is one."""
         if value is not None and not 0.0 < value < float("inf"):
             self.add(
                 f"--stiffness is {value:g} N/m; give the positive stiffness of the free stack from"
@@ -287,27 +284,27 @@ def meant(word: str, known: Iterable[str]) -> str:
 
 
 def similar(word: str, known: Iterable[str], otherwise: str) -> str:
-    """Return the question which of the known words is meant, or what is said where none is like."""
+    """Return the question which of the known words is meant, `otherwise` where none is similar."""
     near = difflib.get_close_matches(word, list(known), n=3, cutoff=0.4)
     return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
 def step_seconds(text: str) -> float:
-    """Return the time [s] of a step that is given as a number with its unit; none is guessed.
+    """Return the time [s] of a step, a number with its unit; none is guessed.
 
     Raises InputError for anything else.
     """
     from psa_casadi.units import parse_unit, to_si, units_of
 
-    result = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
+    match = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
     try:
-        number = float(result["number"]) if result else 0.0
+        number = float(match["number"]) if match else 0.0
     except ValueError:
-        result = None
-    if result and not result["unit"].strip():
-        meant = " or ".join(f"{result['number']}{unit}" for unit in ("s", "ms", "us"))
+        match = None
+    if match and not match["unit"].strip():
+        meant = " or ".join(f"{match['number']}{unit}" for unit in ("s", "ms", "us"))
         raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
-    unit = parse_unit(result["unit"], "time").name if result else ""
+    unit = parse_unit(match["unit"], "time").name if match else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written
+from psa_casadi.cli.screen import show, show_written
 
 
 def linearize(
@@ -24,7 +24,7 @@ def linearize(
     observer: Path | None = None,
     noise: list[str] | None = None,
     step: float = 1e-4,
-    arguments: Given,
+    inputs: Inputs,
 ) -> None:
     """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
 
@@ -49,32 +49,29 @@ def linearize(
     Example:
         psa linearize --stack P-885.51 --at voltage=60 -o stack.mat --figure bode.png
     """
-    from psa_casadi.report.plots.figures import save_bode
+    from psa_casadi.report.plots.figures import bode_figure, write_figure
 
-    arguments.outputs(
-        {"--output": output, "--figure": figure, "--observer": observer}, [model, fmu]
-    )
-    chosen = own_model(arguments, model, Fitting(fmu=fmu), fitted=False)
+    inputs.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
+    chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
     if chosen is None:
-        chosen = arguments.model_or_stack(model, stack, any_model=True)
-    inputs, states = arguments.numbers("--at", at), arguments.numbers("--state", state)
-    sizes, loop = arguments.numbers("--noise", noise), _parsed(arguments, controller)
-    arguments.check()
-    result = psa.linearize(arguments.ready(chosen), inputs, states=states)
-    show(repr(result), arguments.quiet)
+        chosen = inputs.model_or_stack(model, stack, any_model=True)
+    point, states = inputs.numbers("--at", at), inputs.numbers("--state", state)
+    sizes, loop = inputs.numbers("--noise", noise), _parsed(inputs, controller)
+    inputs.check()
+    result = psa.linearize(inputs.ready(chosen), point, states=states)
+    show(repr(result))
     if loop is not None:
         m = psa.margins(result, loop, input=from_, output=to)
         ends = "stable" if m["stable"] else "NOT STABLE"
         show(
             f"loop: gain margin {m['gain_margin']:.4g} at {m['gain_margin_at']:.4g} Hz, phase"
             f" margin {m['phase_margin']:.4g} degrees at {m['phase_margin_at']:.4g} Hz, delay"
-            f" margin {m['delay_margin']:.4g} s; the closed loop is {ends}",
-            arguments.quiet,
+            f" margin {m['delay_margin']:.4g} s; the closed loop is {ends}"
         )
     if output is not None:
         result.save(output)
     if figure is not None:
-        save_bode(result, figure)
+        write_figure(bode_figure(result), figure)
     if observer is not None:
         made = psa.observer(
             result,
@@ -86,10 +83,10 @@ def linearize(
             psa.export_fmu(made, observer)
         else:
             psa.export_c(made, observer, step=step)
-    tell_written(output, figure, observer, quiet=arguments.quiet)
+    show_written(output, figure, observer)
 
 
-def _parsed(inputs: Given, controller: str | None) -> tuple[list[float], list[float]] | None:
+def _parsed(inputs: Inputs, controller: str | None) -> tuple[list[float], list[float]] | None:
     """Return numerator and denominator of a controller's text; None without one."""
     if controller is None:
         return None

@@ -1,10 +1,10 @@
-"""A command is a function: what its arguments are for stands in its docstring, under `Options:`.
+"""A command is a function: its docstring describes its arguments, under `Options:`.
 
 What to type, under `Example:`, is the end of its help.
 
 Arguments before the star are words of the command line, those behind it options. One whose type is
-a dataclass stands for the options that are its fields. What a command does not say of an option
-that several have:
+a dataclass means the options that are its fields. The usual text of options that several commands
+have:
 
 Options:
     records: Records of one device: CSV, Excel, MATLAB and other files.
@@ -47,9 +47,9 @@ _ENTRY = re.compile(r"^    (\w+): (.*(?:\n {8,}.*)*)", re.MULTILINE)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Return a function as typer takes it, with its errors told in sentences."""
-    about, item = _described(function)
-    helps = {**_SHARED, **item}
+    """Return a function as typer takes it, with its errors as sentences."""
+    about, own_helps = _described(function)
+    helps = {**_SHARED, **own_helps}
     parameters: list[inspect.Parameter] = []
     groups: dict[str, tuple[Any, tuple[str, ...]]] = {}
     for p in inspect.signature(function).parameters.values():
@@ -57,7 +57,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             group: Any = p.annotation
             fields = inspect.signature(group).parameters
             groups[p.name] = group, tuple(fields)
-            table = {**_SHARED, **_described(group)[1], **item}
+            table = {**_SHARED, **_described(group)[1], **own_helps}
             parameters += [_declared(q, table) for q in fields.values()]
         else:
             parameters.append(_declared(p, helps))
@@ -73,7 +73,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
 
 def _described(described: object) -> tuple[str, dict[str, str]]:
-    """Return a docstring without its section of options, and what that says of each."""
+    """Return a docstring without its section of options, and the text of each."""
     doc, _, _ = (inspect.getdoc(described) or "").partition("\n\nExample:\n")
     about, _, section = doc.partition("\n\nOptions:\n")
     return about, {name: " ".join(text.split()) for name, text in _ENTRY.findall(section)}
@@ -100,7 +100,7 @@ def _declared(p: inspect.Parameter, helps: dict[str, str]) -> inspect.Parameter:
     return p.replace(annotation=Annotated[kind, known], kind=inspect.Parameter.KEYWORD_ONLY)
 
 
-#: Where the names of each kind are; a module loads when it is asked for.
+#: Where the names of each kind are; a module loads when it is needed.
 _KNOWN = {
     "stacks": ("psa_casadi.model.stacks", "STACKS"),
     "effects": ("psa_casadi.effects", "EFFECTS"),
@@ -144,7 +144,7 @@ class Reading:
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Where a run begins.
+    """The start of a run.
 
     Options:
         start_voltage: Voltage [V] that holds the stack when it starts, settled, with the memory

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading
 from psa_casadi.errors import InputError, quoted
 
@@ -19,7 +19,7 @@ _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 
 @dataclass(frozen=True, kw_only=True)
 class Fitting:
-    """How a model of one's own is fitted: words of `psa.identify(model, records)`.
+    """How a model that is no stack is fitted: keyword arguments of `psa.identify(model, records)`.
 
     Options:
         fmu: FMU of any tool, in the place of --model.
@@ -43,7 +43,7 @@ class Fitting:
 
     @property
     def words(self) -> dict[str, Any]:
-        """The words that were given, without what says which model it is."""
+        """The keyword arguments that have a value, without those that name the model."""
         every = {n: v for n, v in asdict(self).items() if v and n not in ("fmu", "value")}
         if self.free:
             every["free"] = [text.partition("=")[0] for text in self.free]
@@ -51,7 +51,7 @@ class Fitting:
 
 
 def own_model(
-    inputs: Given, path: Path | None, fitting: Fitting, *, fitted: bool = True
+    inputs: Inputs, path: Path | None, fitting: Fitting, *, fitted: bool = True
 ) -> psa.Model | None:
     """Return the model that a path names where it is no stack's; None for a stack's or none.
 
@@ -75,7 +75,7 @@ def own_model(
     return model
 
 
-def _model(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
     match = _PYTHON.fullmatch(str(path))
@@ -84,13 +84,13 @@ def _model(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Mod
     if path.suffix.lower() == ".fmu" or fitting.fmu:
         return _imported(inputs, path, fitting, fitted)
     try:
-        model = psa.load_model(path, inputs.own)
-    except InputError:  # which is told where a stack's file is read
+        model = psa.load_model(path, inputs.user_effects)
+    except InputError:  # the reader of a stack's file reports it
         return None
     return None if is_stack(model) else model
 
 
-def _imported(inputs: Given, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
     free: dict[str, tuple[float, float] | None] = {}
     for text in fitting.free or ():
@@ -109,7 +109,7 @@ def _made(file: Path, name: str) -> psa.Model:
     """Return the model that a function of a Python file returns, or that a variable of it is."""
     if not file.is_file():
         raise InputError(f"--model: there is no file {file}; check the name and the directory.")
-    sys.path.append(str(file.resolve().parent))  # what lies beside it can be imported
+    sys.path.append(str(file.resolve().parent))  # modules in its folder can be imported
     try:
         held = runpy.run_path(str(file), run_name=file.stem)
         made = held.get(name)
@@ -119,12 +119,12 @@ def _made(file: Path, name: str) -> psa.Model:
             f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
         ) from error
     if not isinstance(model, psa.Model):
-        items = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
-        there = f"; it has {quoted(items)}" if items else ""
-        lacks = f"{file} has no function '{name}' that returns a model{there}. Name one that does"
+        functions = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        known = f"; it has {quoted(functions)}" if functions else ""
+        lacks = f"{file} has no function '{name}' that returns a model{known}. Name one that does"
         if not name:
-            lacks = f"say which function of {file} returns the model{there}"
-        raise InputError(f"--model: {lacks}, as {file}:{items[-1] if items else 'make'}.")
+            lacks = f"say which function of {file} returns the model{known}"
+        raise InputError(f"--model: {lacks}, as {file}:{functions[-1] if functions else 'make'}.")
     return model
 
 
@@ -134,16 +134,16 @@ def own_diagnosis(
     held_out: Sequence[Path],
     fitting: Fitting,
     reading: Reading,
-    inputs: Given,
+    inputs: Inputs,
     *,
     leave_out: Sequence[str],
     others: Mapping[str, object],
 ) -> Callable[..., psa.Diagnosis]:
-    """Read the records of a model of one's own; return what diagnoses it.
+    """Read the records of a model that is no stack; return a function that diagnoses it.
 
-    That takes `progress` and `watch`; `others` are options that must be empty.
+    It takes `progress` and `watch`; `others` are options that must be empty.
     """
-    components = inputs.of_any_model()
+    components = inputs.effects_of_any_model()
     inputs.refuse(others)
     measured, held = (inputs.signals(model, part, reading) for part in (records, held_out))
     return partial(

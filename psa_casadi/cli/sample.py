@@ -8,11 +8,11 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, width, working
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.cli.screen import show, show_written, width, working
+from psa_casadi.files import atomic_write
 
 
 def sample(
@@ -32,7 +32,7 @@ def sample(
     reading: Reading,
     fitting: Fitting,
     origin: Origin = "measured",
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Draw the parameters of a model from their posterior, given records (extra sample).
 
@@ -58,7 +58,7 @@ def sample(
         psa sample record.csv --model model.json -o posterior.nc --figure posterior.png
     """
     from psa_casadi.report.documents.files import posterior_file
-    from psa_casadi.report.plots.figures import DPI, picture_format, posterior_figure
+    from psa_casadi.report.plots.figures import posterior_figure, write_figure
     from psa_casadi.report.words.text import posterior_text
     from psa_casadi.strict_json import json_text
 
@@ -76,7 +76,7 @@ def sample(
         measured = inputs.records(records, reading)
         start = inputs.model_or_stack(model, stack)
     start = inputs.ready(start)
-    with working("sampling", inputs.quiet) as progress:
+    with working("sampling") as progress:
         result = psa.sample(
             start, measured, prior=centres, widths=widths, chains=chains, draws=draws, tune=tune,
             seed=seed, progress=progress, **fitting.words,
@@ -87,15 +87,14 @@ def sample(
         if json is not None:
             atomic_write(json, json_text(posterior_file(result)))
         if figure is not None:
-            with atomic_path(figure) as temporary:
-                posterior_figure(result).savefig(temporary, format=picture_format(figure), dpi=DPI)
+            write_figure(posterior_figure(result), figure)
         if report is not None:
             psa.report(result, report)
-    show(posterior_text(result, origin=origin, width=width()), inputs.quiet)
-    tell_written(*files.values(), quiet=inputs.quiet)
+    show(posterior_text(result, origin=origin, width=width()))
+    show_written(*files.values())
 
 
-def _priors(inputs: Given, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
+def _priors(inputs: Inputs, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
     """Return centres and widths by the names of the parameters."""
     centres: dict[str, float] = {}
     widths: dict[str, float] = {}

@@ -1,6 +1,5 @@
 """`psa simulate`: what a model does with its inputs."""
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -8,10 +7,10 @@ from typing import Any, Literal
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.cli.screen import show, show_written, working
 from psa_casadi.errors import Problems
 from psa_casadi.shown import with_units
 from psa_casadi.units import FloatArray, convert
@@ -30,7 +29,7 @@ def simulate(
     figure: Path | None = None,
     reading: Reading,
     begin: Start,
-    arguments: Given,
+    inputs: Inputs,
 ) -> None:
     """Simulate a model on measured or planned inputs; write every output with its unit.
 
@@ -55,49 +54,47 @@ def simulate(
     Example:
         psa simulate --stack P-885.51 --input voltage.csv --history 120,0 -o out.csv
     """
-    from psa_casadi.files import atomic_path
-    from psa_casadi.report.plots.figures import DPI, columns_figure, picture_format
+    from psa_casadi.report.plots.figures import columns_figure, write_figure
 
-    arguments.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
+    inputs.outputs({"--output": output, "--figure": figure}, [model, fmu, input_])
     imported = fmu is not None or (model is not None and model.suffix.lower() == ".fmu")
     chosen_by = Fitting(fmu=fmu, value=value if imported else None)
-    item = partial(own_model, arguments, model, chosen_by, fitted=False)
-    chosen, record = _read(arguments, item, model, stack, input_, begin, reading)
-    turns = arguments.turns(begin.history)
-    values = {} if imported else arguments.numbers("--value", value)
-    starts = arguments.numbers("--start", start)
+    any_model = own_model(inputs, model, chosen_by, fitted=False)
+    chosen, record = _read(inputs, any_model, model, stack, input_, begin, reading)
+    turns = inputs.turns(begin.history)
+    values = {} if imported else inputs.numbers("--value", value)
+    starts = inputs.numbers("--start", start)
     if chosen is not None:
-        chosen = arguments.attempt(partial(_begun, chosen, values, starts))
-    chosen, record = arguments.ready(chosen), arguments.ready(record)
-    with working("simulating", arguments.quiet):
-        inputs = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
+        chosen = inputs.attempt(partial(_changed, chosen, values, starts))
+    chosen, record = inputs.ready(chosen), inputs.ready(record)
+    with working("simulating"):
+        applied = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):
-            outputs, report = _of_a_stack(chosen, inputs, record, turns, begin, starts, hold)
+            outputs, report = _of_a_stack(chosen, applied, record, turns, begin, starts, hold)
         else:
-            u = np.column_stack([np.empty((record.n, 0)), *inputs.values()])
+            u = np.column_stack([np.empty((record.n, 0)), *applied.values()])
             x0 = np.array([q.start for q in chosen.structure.states])
             y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
             outputs = dict(zip(chosen.output_names, y.T, strict=True))
             report = _start_values(chosen, starts), ""
-        signals = _as_displayed(chosen, record.time, {**inputs, **outputs})
+        signals = _as_displayed(chosen, record.time, {**applied, **outputs})
         written = with_units(
             {"time": record.time, **signals.columns}, {"time": "s", **signals.units}
         )
         psa.write_record(output, written)
         if figure is not None:
-            with atomic_path(figure) as temporary:
-                drawn = columns_figure(signals, [n for n in chosen.output_names if n in outputs])
-                drawn.savefig(temporary, format=picture_format(figure), dpi=DPI)
+            first = [n for n in chosen.output_names if n in outputs]
+            write_figure(columns_figure(signals, first), figure)
     begin_times, took = report
-    show(f"start: {begin_times}", arguments.quiet)
-    show(f"{record.n} samples over {record.duration:.6g} s{took}", arguments.quiet)
-    show(f"columns: {', '.join(written)}", arguments.quiet)
-    tell_written(output, figure, quiet=arguments.quiet)
+    show(f"start: {begin_times}")
+    show(f"{record.n} samples over {record.duration:.6g} s{took}")
+    show(f"columns: {', '.join(written)}")
+    show_written(output, figure)
 
 
 def _read(
-    inputs: Given,
-    own_or_none: "Callable[[], psa.Model | None]",
+    inputs: Inputs,
+    any_model: "psa.Model | None",
     model: Path | None,
     stack: str | None,
     input_: Path,
@@ -107,29 +104,25 @@ def _read(
     """Return the model and the record of its inputs, `Signals` where it is no stack's."""
     from psa_casadi.identification.experiments import in_units
 
-    chosen = own_or_none()
-    if chosen is not None:
-        item, problems = chosen, Problems()
+    if any_model is not None:
+        problems = Problems()
         voltage = begin.start_voltage is not None
         inputs.refuse({"--stack": stack, "--start-voltage": voltage, "--history": begin.history})
-        read = next(iter(inputs.signals(item, [input_], reading)), None)
-        signals = read and in_units(item, read, problems)
+        read = next(iter(inputs.signals(any_model, [input_], reading)), None)
+        signals = read and in_units(any_model, read, problems)
         for sentence in problems.sentences():
             inputs.add(sentence)
-        return item, signals
+        return any_model, signals
     chosen = inputs.model_or_stack(model, stack)
     columns = inputs.columns(reading.columns, [input_])
     record = None
     if columns is not None:
-        record = inputs.attempt(
-            lambda: psa.read_record(
-                input_, need_displacement=False, columns=columns, sample_time=reading.sample_time
-            )
-        )
+        read_record = partial(psa.read_record, input_, need_displacement=False, columns=columns)
+        record = inputs.attempt(partial(read_record, sample_time=reading.sample_time))
     return (chosen if begin.start_voltage is None else inputs.started(chosen, begin)), record
 
 
-def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
+def _changed(model: "psa.Model", values: dict[str, float], starts: dict[str, float]) -> "psa.Model":
     """Return a model with other parameters and starts. Raises InputError."""
     for name in values:
         model.parameter(name)
@@ -137,13 +130,13 @@ def _begun(model: "psa.Model", values: dict[str, float], starts: dict[str, float
 
 
 def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
-    """Say that the model's start values hold, and which of them --start has given."""
+    """Say that the model's start values hold, and which of them --start has set."""
     from psa_casadi.report.words.phrases import with_unit
 
     every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
     units = {v.name: v.unit for v in every}
-    items = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
-    others = f", but for {', '.join(items)}" if items else ""
+    texts = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
+    others = f", but for {', '.join(texts)}" if texts else ""
     return f"the start values of the model{others}"
 
 
@@ -156,7 +149,7 @@ def _of_a_stack(
     starts: dict[str, float],
     hold: str,
 ) -> tuple[dict[str, FloatArray], tuple[str, str]]:
-    """Return the outputs of a stack, and in words where it begins and what it took."""
+    """Return the outputs of a stack, and texts on its start and its steps."""
     as_exported = begin.start_voltage is not None or (begin.history is None and model.starts_itself)
     first, memory = float(record.voltage[0]), None
     if begin.history is not None and not as_exported:
@@ -176,16 +169,16 @@ def _as_displayed(
     every: list[psa.Input | psa.Output] = [*model.structure.inputs, *model.structure.outputs]
     there = [v for v in every if v.name in columns]
     units = {v.name: v.display_unit or v.unit for v in there}
-    table = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
-    return psa.Signals(name=model.name, time=time, columns=table, units=units)
+    values = {v.name: convert(columns[v.name], v.unit, units[v.name]) for v in there}
+    return psa.Signals(name=model.name, time=time, columns=values, units=units)
 
 
 def start_sentence(
     model: "psa.Model", record: "psa.Record", history: str | None, values: str
 ) -> str:
-    """Say where a simulation on a record begins, and how an exported FMU begins there too.
+    """Say where a simulation on a record starts, and how an exported FMU starts there too.
 
-    `values` says that it begins at start values, and at which.
+    `values` is the text for start values, if it starts at these.
     """
     from psa_casadi.simulation.start import initial_slope
 

@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, tell, tell_written, working
+from psa_casadi.cli.screen import print_message, show_always, show_written, working
 from psa_casadi.errors import InputError
 from psa_casadi.files import temporary_folder
 
 if TYPE_CHECKING:
     import psa_casadi as psa
-    from psa_casadi.workbench.subject import Subject
+    from psa_casadi.workbench.previews import Subject
 
 
 def web(
@@ -33,7 +33,7 @@ def web(
     port: Annotated[int | None, typer.Option(min=1, max=65535)] = None,
     no_browser: bool = False,
     fitting: Fitting,
-    inputs: Given,
+    inputs: Inputs,
 ) -> None:
     """Write a page to play with a stack: any voltage, every effect, no network.
 
@@ -58,14 +58,14 @@ def web(
     if more.args:
         raise InputError(f"{more.args[0]}: is one file too many; give one model, by --model.")
     if diagnose:
-        item = own_model(inputs, model, fitting)
-        if (model is not None and item is None) or stack is not None or output is not None:
+        any_model = own_model(inputs, model, fitting)
+        if (model is not None and any_model is None) or stack is not None or output is not None:
             raise InputError(
                 "--diagnose serves a page of its own: leave --stack, -o and a stack's --model out;"
                 " a MODEL.json to start from is dropped there."
             )
         inputs.check()
-        _serve(port or 0, no_browser, _subject(item, model, fitting), inputs)
+        _serve(port or 0, no_browser, _subject(any_model, model, fitting), inputs)
         return
     from psa_casadi.report.page.playground import write_playground
 
@@ -77,22 +77,22 @@ def web(
     inputs.outputs({"--output": path}, [model], page="--output")
     chosen = inputs.model_or_stack(model, stack, needed=False)
     inputs.check()
-    with working("compiling", inputs.quiet):
+    with working("compiling"):
         write_playground(path, chosen)
-    tell_written(path, quiet=inputs.quiet)
+    show_written(path)
 
 
 def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
-    """Return what the page diagnoses: a stack, or a model of one's own."""
-    from psa_casadi.workbench.subject import Subject
+    """Return the subject of the page: a stack, or any other model."""
+    from psa_casadi.workbench.previews import Subject
 
     if model is None:
         return Subject()
-    words = {"model": path and path.absolute(), **asdict(fitting)}
+    options = {"model": path and path.absolute(), **asdict(fitting)}
     if fitting.fmu:
-        words["fmu"] = fitting.fmu.name
+        options["fmu"] = fitting.fmu.name
     arguments: list[str] = []
-    for option, value in words.items():
+    for option, value in options.items():
         values = value if isinstance(value, list) else [value] if value else []
         begin = f"--{option.replace('_', '-')}"
         arguments += [begin if value is True else f"{begin}={v}" for v in values]
@@ -102,7 +102,7 @@ def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> 
     return Subject(model.input_names, model.output_names, units, tuple(arguments), fmus)
 
 
-def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> None:
+def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Inputs) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.workbench.desk import Desk
@@ -114,12 +114,12 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> No
     with temporary_folder() as place:
         folder = place / "files"
         folder.mkdir()
-        desk = Desk(folder, list(known_effects(inputs.own)), modules, subject)
+        desk = Desk(folder, list(known_effects(inputs.user_effects)), modules, subject)
         with suppress(KeyboardInterrupt), served(port, desk) as server:
-            show(f"Open {server.address}")
-            tell("Ctrl-C ends the page and removes its files.")
+            show_always(f"Open {server.address}")
+            print_message("Ctrl-C ends the page and removes its files.")
             sys.stdout.flush()
-            if not no_browser:  # by a file that leads there: other users see what it is told
+            if not no_browser:  # by a file that leads there: other users see its command line
                 way, address = place / "open.html", escape(server.address)
                 way.write_text(
                     f'<!DOCTYPE html><meta http-equiv="refresh" content="0;url={address}">'
@@ -129,4 +129,4 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Given) -> No
                 webbrowser.open(way.as_uri())
             while True:
                 time.sleep(3600.0)
-        tell("Ended; the files of the page are removed.")
+        print_message("Ended; the files of the page are removed.")

@@ -294,7 +294,7 @@ class Diagnosis(Reported):
 
     def __repr__(self) -> str:
         """Return the verdict, the causes with their sizes, the errors and what remains."""
-        return str(made("told", self))
+        return str(made("diagnosis_text", self))
 
     def to_frame(self) -> Any:
         """Return the samples as a pandas DataFrame: measured, base and extended by output.

@@ -1,9 +1,9 @@
-"""What results show of themselves: pictures, pages, a notebook's cell, a line."""
+"""The views of results: pictures, pages, a notebook's cell, a line."""
 
 import base64
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,17 +21,11 @@ from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
 from psa_casadi.report.plots.figures import Plotted, figure_of, one_output
-from psa_casadi.report.words.phrases import number, percent, plain
+from psa_casadi.report.words.phrases import counted, number, percent, plain
 from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
 
-_WORDS: dict[type, Callable[..., str]] = {
-    StackDiagnosis: story,
-    StackIdentification: identification_text,
-    Posterior: posterior_text,
-}
-Told = AnyDiagnosisFile
 Reported = Diagnosis | Identification | Posterior | Population | Sequence[Finding]
 
 
@@ -39,7 +33,7 @@ def report(result: Reported, path: str | os.PathLike[str], *, still: bool = Fals
     """Write the page of a result, one HTML file below 3 MB that needs no network.
 
     The model of a stack runs in the page unless it is to be `still`. Several findings
-    (`read_findings`) are shown side by side.
+    (`read_findings`) come side by side.
 
     Raises:
         InputError: `path` cannot be written to.
@@ -65,15 +59,14 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
     return figure_of(result) if whole else one_output(result, ax, output)
 
 
-def line(result: Plotted | Told) -> str:
+def line(result: Plotted | AnyDiagnosisFile) -> str:
     """Return a result in one line."""
     if isinstance(result, Diagnosis | AnyDiagnosisFile):
         return _diagnosis(result)
     if isinstance(result, StackIdentification):
-        count = len(result.experiments)
+        records = counted(len(result.experiments), "record")
         span = max(e.record.range_m for e in result.experiments)
         rest = number(100.0 * result.fit.rms / span, 2)
-        records = f"{count} record{'' if count == 1 else 's'}"
         free = len(result.determinacy.names)
         return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
     if isinstance(result, Identification | Signals):
@@ -86,7 +79,7 @@ def line(result: Plotted | Told) -> str:
     return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
 
 
-def _diagnosis(d: Diagnosis | Told) -> str:
+def _diagnosis(d: Diagnosis | AnyDiagnosisFile) -> str:
     named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
     causes = f": {named}" if named else ""
     if not isinstance(d, StackDiagnosis | DiagnosisFile):
@@ -97,7 +90,7 @@ def _diagnosis(d: Diagnosis | Told) -> str:
     return f"<Diagnosis {d.verdict}{causes}; held-out error {errors}>"
 
 
-def cell(result: Plotted | Model | Told) -> str:
+def cell(result: Plotted | Model | AnyDiagnosisFile) -> str:
     """Return a result as a notebook shows it: its words, and its picture or table."""
     if isinstance(result, Model):
         return filled("cell.html", lines=[repr(result)], table=parameter_table(result))
@@ -108,8 +101,12 @@ def cell(result: Plotted | Model | Told) -> str:
     picture = base64.b64encode(buffer.getvalue()).decode("ascii")
     if isinstance(result, Signals):
         return filled("cell.html", lines=[repr(result)], name=repr(result), picture=picture)
-    words = line(result) if isinstance(result, Trajectory) else repr(result)
-    for kind, notify in _WORDS.items():
-        if isinstance(result, kind):
-            words = notify(result)
-    return filled("cell.html", told=words, name=line(result), picture=picture)
+    if isinstance(result, StackDiagnosis):
+        words = story(result)
+    elif isinstance(result, StackIdentification):
+        words = identification_text(result)
+    elif isinstance(result, Posterior):
+        words = posterior_text(result)
+    else:
+        words = line(result) if isinstance(result, Trajectory) else repr(result)
+    return filled("cell.html", words=words, name=line(result), picture=picture)

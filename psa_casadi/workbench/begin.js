@@ -1,5 +1,5 @@
 // What all scripts of the page share: elements made of text alone, never of markup.
-var desk = {told: JSON.parse(document.getElementById('told').textContent)};
+var desk = {setup: JSON.parse(document.getElementById('page-data').textContent)};
 
 desk.el = function (id) { return document.getElementById(id); };
 

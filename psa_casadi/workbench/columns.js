@@ -1,7 +1,7 @@
 // The first rows of the files, a choice for every column, and the text of --columns that it makes.
 desk.columns = (function () {
   'use strict';
-  var make = desk.make, units = desk.told.columns;
+  var make = desk.make, units = desk.setup.columns;
 
   function parts(text) { return text.split(',').filter(function (part) { return part.trim(); }); }
   // The file that a part of --columns names, as b.csv@time=t:ms does; '' for all of them.

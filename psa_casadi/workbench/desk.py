@@ -1,4 +1,4 @@
-"""The files of the page and its runs; what lies there is the same for every tab."""
+"""The files of the page and its runs, the same for every tab."""
 
 import re
 import shutil
@@ -13,12 +13,9 @@ from psa_casadi.characters import plain, visible
 from psa_casadi.errors import InputError
 from psa_casadi.records.read.file_bytes import MOST_BYTES
 from psa_casadi.workbench import run as runs
-from psa_casadi.workbench.previews import preview
+from psa_casadi.workbench.previews import Subject, preview
 from psa_casadi.workbench.run import Run, Settings, removed
-from psa_casadi.workbench.subject import Subject
 
-#: The most files, and the most bytes of all of them together.
-MOST_FILES, MOST_TOGETHER = 32, 2 * MOST_BYTES
 #: The longest name, in letters.
 _LONGEST = 80
 _BLOCK = 2**20
@@ -31,14 +28,14 @@ class Limits:
     """The most that is taken: bytes of one file, of all together, and files."""
 
     one: int = MOST_BYTES
-    together: int = MOST_TOGETHER
-    files: int = MOST_FILES
+    together: int = 2 * MOST_BYTES
+    files: int = 32
 
 
 def stored_name(name: str, taken: Collection[str]) -> str:
     """Return a name to store a file by: without paths and marks, and unlike those that are taken.
 
-    The ending is kept, as it says how a file is read.
+    The ending is kept, as it decides how a file is read.
     """
     last = re.split(r"[\\/]", plain(name))[-1]
     clean = _BARRED.sub("_", last).strip(" .").lstrip("-").strip(" .") or "record"
@@ -56,7 +53,7 @@ def shown_name(name: str) -> str:
 
 
 def received(stream: BufferedIOBase, size: int, target: Path, admit: Callable[[int], None]) -> None:
-    """Write so many bytes of a stream to a new file; `admit` is asked with how many there are.
+    """Write `size` bytes of a stream to a new file; `admit` gets the count so far, and may refuse.
 
     Raises:
         InputError: the stream ends before, or the file cannot be written.
@@ -85,7 +82,7 @@ class BusyError(Exception):
 class Item:
     """A file on the workbench: the name that it had, and where it lies by a name without marks.
 
-    It may be kept for judging only; `seen` says how it reads, once that is known.
+    It may be held out; `preview` holds its columns and its picture, once they are known.
     """
 
     key: int
@@ -93,7 +90,7 @@ class Item:
     path: Path
     size: int
     held: bool = False
-    seen: dict[str, Any] | None = field(default=None, compare=False)
+    preview: dict[str, Any] | None = field(default=None, compare=False)
 
     @property
     def is_model(self) -> bool:
@@ -101,16 +98,16 @@ class Item:
         return self.path.suffix.lower() == ".json"
 
     def state(self) -> dict[str, Any]:
-        """Return what the page shows of it."""
-        table = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
-        return {**table, "held": self.held, "model": self.is_model, "seen": self.seen}
+        """Return its state for the page."""
+        state = {"key": self.key, "name": self.name, "stored": self.path.name, "size": self.size}
+        return {**state, "held": self.held, "model": self.is_model, "seen": self.preview}
 
 
 class Desk:
     """Files, settings and the run in a folder; any thread may ask. `close` ends what runs.
 
-    What is given lies in a folder of its own, where nothing runs; runs leave theirs beside it.
-    `effects` are the names that may be left out, `modules` those of a user's own effects, `subject`
+    The records lie in a separate folder, where nothing runs; runs leave their files next to it.
+    `effects` are the names that may be left out, `modules` those of a user's effects, `subject`
     is the model that the records are of: a stack's, unless another one is named.
     """
 
@@ -154,7 +151,7 @@ class Desk:
         def arrive(count: int) -> None:
             with self._lock:
                 self._admit(key, name, count)
-                self._arrived[key] = count  # what is promised takes no room from others
+                self._arrived[key] = count  # what is announced takes no room from others
 
         try:
             received(stream, size, coming, arrive)
@@ -173,7 +170,7 @@ class Desk:
         self._look([key])
 
     def _admit(self, key: int, name: str, size: int) -> None:
-        """Refuse a file of so many bytes that finds no room beside what is there and arrives."""
+        """Refuse a file of `size` bytes without room next to what is there and what arrives."""
         with self._lock:
             there = sum(i.size for i in self._items.values())
             there += sum(n for k, n in self._arrived.items() if k != key)
@@ -260,23 +257,23 @@ class Desk:
         both = (self._run, self._export)
         return [r for r in both if r is not None and r.status == "running"]
 
-    # What is told
+    # State
 
-    def state(self, version: int, number: int, observed: int) -> dict[str, Any]:
-        """Return what has changed for a tab that knows a version and so many events of a run."""
+    def state(self, version: int, number: int, event_count: int) -> dict[str, Any]:
+        """Return what has changed for a tab that knows a version and a count of events of a run."""
         with self._lock:
-            table: dict[str, Any] = {"version": self._version}
+            state: dict[str, Any] = {"version": self._version}
             if self._run is not None:
                 self._run.look()
-                new = self._run.events[observed if number == self._number else 0 :]
-                table["run"] = {**self._run.state(), "number": self._number, "events": new}
-            table["export"] = None if self._export is None else self._export.state()
+                new = self._run.events[event_count if number == self._number else 0 :]
+                state["run"] = {**self._run.state(), "number": self._number, "events": new}
+            state["export"] = None if self._export is None else self._export.state()
             if version != self._version:
-                table["items"] = [i.state() for i in self._items.values()]
-                table["settings"] = vars(self._settings)
-                table["result"] = runs.found(self.folder)
-                table["files"] = runs.files_left(self.folder)
-            return table
+                state["items"] = [i.state() for i in self._items.values()]
+                state["settings"] = vars(self._settings)
+                state["result"] = runs.diagnosis_summary(self.folder)
+                state["files"] = runs.files_left(self.folder)
+            return state
 
     def result(self, name: str) -> Path | None:
         """Return the place of a file that a run has left, None where there is none of this name."""
@@ -295,7 +292,7 @@ class Desk:
             )  # fmt: skip
             with self._lock:
                 if self._items.get(key) == item and settings == self._settings:
-                    self._items[key] = replace(item, seen=table)
+                    self._items[key] = replace(item, preview=table)
                     self._changed()
 
     def _idle(self) -> None:

@@ -1,4 +1,4 @@
-"""What a file looks like: first rows, columns, a small picture. Read in a process of its own.
+"""A preview of a file: first rows, columns, a small picture; read in a separate process.
 
 A damaged file may end the process that reads it, and a large one fills its memory; neither is to
 end the page.
@@ -11,6 +11,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,37 @@ from psa_casadi.errors import InputError, MachineError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import TABLE, columns_of, parse_columns
 from psa_casadi.records.read.reading import read_records, read_signals
-from psa_casadi.records.record import Record
+from psa_casadi.records.record import COLUMNS, Record
 from psa_casadi.records.signals import Signals
-from psa_casadi.workbench.subject import Subject
+from psa_casadi.units import parse_unit, units_of
 
 #: Time [s] that a file may take.
 _LIMIT_S = 120.0
 _MODULE = "psa_casadi.workbench.previews"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The model whose records are diagnosed; without inputs and outputs it is a stack's.
+
+    `units` are those of its inputs and outputs. `arguments` name it to the command `psa diagnose`,
+    `files` are those next to which the command runs.
+    """
+
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    arguments: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    @property
+    def columns(self) -> dict[str, list[str]]:
+        """The columns of its records, each with the units that it may have, the model's first."""
+        if not self.units:
+            return {n: [u for q in c.quantities for u in units_of(q)] for n, c in COLUMNS.items()}
+        units = {n: units_of(parse_unit(u).quantity) for n, u in self.units.items()}
+        columns = {n: list(dict.fromkeys([u, *units[n]])) for n, u in self.units.items()}
+        return {"time": list(units_of("time")), **columns}
 
 
 def preview(
@@ -63,8 +88,8 @@ def preview(
         return _problem(
             f"{path.name}: the process that read it has ended; the file is damaged or too large."
         )
-    table: dict[str, Any] = json.loads(done.stdout)
-    return table
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
 
 
 def looked_at(
@@ -77,7 +102,7 @@ def looked_at(
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return what `preview` returns of a file in this folder, read in this process."""
-    head, problems, output = None, [], None
+    head, problems, record_summary = None, [], None
     names = (*inputs, *outputs)
     try:
         wanted = parse_columns(columns, names) if columns else {}
@@ -87,28 +112,28 @@ def looked_at(
             signals, *_ = read_signals(
                 file, inputs=inputs, outputs=outputs, columns=wanted, sample_time=sample_time
             )
-            output = _told_of_signals(signals, inputs)
+            record_summary = _signals_summary(signals, inputs)
         else:
             record, *_ = read_records(
                 [file], columns=wanted, sample_time=sample_time, need_excitation=not held
             )
-            output = _told(record)
+            record_summary = _record_summary(record)
     except InputError as error:
         problems = list(error.problems)
-    table = _problem(*problems)
+    answer = _problem(*problems)
     if head is not None:
         guess = {name: [f.index, f.unit] for name, f in head.guess.items()}
-        table["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
-        table["head"]["guess"] = guess
-    table["record"] = output
-    return table
+        answer["head"] = {n: getattr(head, n) for n in ("names", "units", "rows", "tables")}
+        answer["head"]["guess"] = guess
+    answer["record"] = record_summary
+    return answer
 
 
 def _problem(*sentences: str) -> dict[str, Any]:
     return {"head": None, "problems": list(sentences), "record": None}
 
 
-def _told(record: Record) -> dict[str, Any]:
+def _record_summary(record: Record) -> dict[str, Any]:
     """Return how long a record is, what it reaches, and its picture."""
     others = ("load_force", "current", "temperature", "monitor_voltage", "charge",
               "displacement_2", "strain")  # fmt: skip
@@ -120,8 +145,8 @@ def _told(record: Record) -> dict[str, Any]:
     }
 
 
-def _told_of_signals(signals: Signals, inputs: Sequence[str]) -> dict[str, Any]:
-    """Return what `_told` returns, of a record on any model."""
+def _signals_summary(signals: Signals, inputs: Sequence[str]) -> dict[str, Any]:
+    """Return what `_record_summary` returns, of a record on any model."""
     measured = {n: signals.units.get(n, "") for n in signals.columns if n not in inputs}
     return {
         **_extent(signals, measured),
@@ -184,13 +209,13 @@ def _png(figure: Figure) -> str:
 
 
 def main() -> None:
-    """Read what is asked for on the command line and write the answer to standard output."""
+    """Read the file that the command line names, and write its preview to standard output."""
     end_with_parent()
     content = json.loads(sys.argv[1])
     out = sys.stdout
-    with contextlib.redirect_stdout(sys.stderr):  # libraries may say something
-        table = looked_at(**content)
-    json.dump(table, out, allow_nan=False)
+    with contextlib.redirect_stdout(sys.stderr):  # libraries may print
+        answer = looked_at(**content)
+    json.dump(answer, out, allow_nan=False)
 
 
 if __name__ == "__main__":

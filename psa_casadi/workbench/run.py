@@ -1,4 +1,4 @@
-"""One diagnosis or export: the command it is, what the search tells meanwhile, what it leaves."""
+"""One diagnosis or export: its command, the events of its search, its files."""
 
 import contextlib
 import json
@@ -17,21 +17,21 @@ from psa_casadi.children import Child, close_pipes, interrupt, kill, started_pyt
 from psa_casadi.errors import InputError, MachineError
 
 Status = Literal["running", "done", "failed", "stopped"]
-#: Lines that are kept of what a command says, and the longest part of one.
+#: Lines of output that are kept of a command, and the longest part of one.
 _LINES, _LONGEST_LINE = 400, 2000
 #: Time [s] that an interrupted command has to write what it keeps.
 _PATIENCE = 20.0
 #: The module that is the command `psa` in a child.
 PSA = "psa_casadi.cli.child"
-#: The folder of the records, beside what a run leaves.
+#: The folder of the records, next to what a run leaves.
 RECORDS = "records"
 #: The files of a diagnosis, and of an export of its model.
 MODEL, JSON, REPORT, EVENTS, FMU = (
     "extended.json", "diagnosis.json", "report.html", "events.jsonl", "extended.fmu",
 )  # fmt: skip
-#: Names that what a diagnosis leaves may have beside these.
+#: Patterns of further files of a diagnosis.
 _MORE = ("extended_*_for_*.json", "diagnosis_next.csv")
-#: Letters of a text: of --columns for all files that may be given.
+#: Letters of a text: enough for --columns of all files.
 _LONGEST = 8000
 _FORMS = ("", "bouc-wen", "spectrum", "best")
 
@@ -40,7 +40,7 @@ _FORMS = ("", "bouc-wen", "spectrum", "best")
 class Settings:
     """What a person chooses for a diagnosis; texts as the options of the command have them.
 
-    `stiffness` is in N/m, `sample_time` in s, each "" where it is not given.
+    `stiffness` is in N/m, `sample_time` in s, each "" by default.
     """
 
     columns: str = ""
@@ -50,7 +50,7 @@ class Settings:
     leave_out: tuple[str, ...] = ()
 
     def changed(self, table: Mapping[str, Any], effects: Sequence[str]) -> "Settings":
-        """Return the settings with what is given; raises InputError for what cannot be."""
+        """Return the settings with these changes; raises InputError for values that cannot be."""
         texts = ("columns", "sample_time", "stiffness", "hysteresis")
         new = {name: str(table[name]).strip()[:_LONGEST] for name in texts if name in table}
         left_out = table.get("leave_out", self.leave_out)
@@ -69,7 +69,7 @@ class Settings:
         return replace(self, **new, leave_out=tuple(e for e in effects if e in left_out))
 
     def without(self, file: str) -> "Settings":
-        """Return the settings without what --columns says of a file that is gone."""
+        """Return the settings without the part of --columns on a file that is gone."""
         kept = (p for p in self.columns.split(",") if not p.strip().startswith(f"{file}@"))
         return replace(self, columns=",".join(kept))
 
@@ -91,9 +91,9 @@ class Settings:
 class Run:
     """A command that runs, or has run, in the folder of its results; it ends with this process.
 
-    `said` and `told` are what it has written to its two streams by now, line by line; `seconds` is
-    how long it has run, `events` what the search has told. `ended` is called once, from the thread
-    that waits for it.
+    `printed` and `messages` are the lines of its standard output and standard error so far;
+    `seconds` is its run time, `events` are those of the search. `ended` is called once, from the
+    thread that waits for it.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Run:
         module: str = PSA,
         hidden: Sequence[str] = (),
     ) -> None:
-        """Start it; `hidden` arguments are not part of what a person is shown to type."""
+        """Start it; `hidden` arguments are not part of the command that the page shows."""
         self._module, self._arguments, self._folder = module, (*arguments, *hidden), folder
         self._ended, self._stopped, self._read = ended, False, 0
         self._child: Child | None = None
@@ -112,8 +112,8 @@ class Run:
         self.command = shlex.join(["psa", *arguments])
         self.status: Status = "running"
         self.events: list[dict[str, Any]] = []
-        self.said: deque[str] = deque(maxlen=_LINES)
-        self.told: deque[str] = deque(maxlen=_LINES)
+        self.printed: deque[str] = deque(maxlen=_LINES)
+        self.messages: deque[str] = deque(maxlen=_LINES)
         # this thread lives as long as the child: on Linux a child ends with its parent's thread
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
@@ -139,7 +139,7 @@ class Run:
         self._thread.join()
 
     def look(self) -> None:
-        """Read what the search has told since the last look."""
+        """Read the events of the search since the last look."""
         path = self._folder / EVENTS
         if not path.exists():
             return
@@ -157,9 +157,9 @@ class Run:
             "command": self.command,
             "status": self.status,
             "seconds": (self._end or time.monotonic()) - self._begin,
-            "line": self.told[-1] if self.told else "",
-            "said": list(self.said),
-            "told": list(self.told)[-40:],
+            "line": self.messages[-1] if self.messages else "",
+            "printed": list(self.printed),
+            "messages": list(self.messages)[-40:],
         }
 
     def _run(self) -> None:
@@ -169,16 +169,16 @@ class Run:
                 self._child = child
                 if self._stopped:
                     interrupt(child)
-                code = self._heard(child)
+                code = self._collect_output(child)
         except MachineError as error:
-            self.told.append(str(error))
+            self.messages.append(str(error))
         finally:
             self._end = time.monotonic()
             self.status = "stopped" if self._stopped and code else "failed" if code else "done"
             self._ended()
 
-    def _heard(self, child: Child) -> int:
-        """Keep what a child says until it ends; return its exit code."""
+    def _collect_output(self, child: Child) -> int:
+        """Keep the output of a child until it ends; return its exit code."""
 
         def keep(stream: IO[bytes], lines: deque[str]) -> None:
             while row := stream.readline(_LONGEST_LINE):
@@ -186,7 +186,7 @@ class Run:
 
         readers = [
             threading.Thread(target=keep, args=pair, daemon=True)
-            for pair in ((child.stdout, self.said), (child.stderr, self.told))
+            for pair in ((child.stdout, self.printed), (child.stderr, self.messages))
         ]
         if child.stdin is not None:
             child.stdin.close()
@@ -210,7 +210,7 @@ def diagnosis(
     return ["diagnose", *fitted, *kept, *start, *settings.options(), *outputs]
 
 
-def found(folder: Path) -> dict[str, Any] | None:
+def diagnosis_summary(folder: Path) -> dict[str, Any] | None:
     """Return the main figures of the diagnosis that lies in a folder, None where none does."""
     try:
         content = json.loads((folder / JSON).read_text(encoding="utf-8"))

@@ -47,7 +47,7 @@ desk.search = (function () {
     var added = node.causes.filter(function (c) { return !length || from.split('+').indexOf(c) < 0; });
     var line = make('div', {className: key === tree.best ? 'one best' : 'one'}, make('b', {}, length ? '+ ' + added.map(desk.words).join(', ') : 'base model'));
     if (length && e.score !== null) { line.append(bar([{share: Math.max(0, e.score) / most, style: 'full'}], 'score')); }
-    line.append(make('small', {}, (length ? 'score ' + (e.score === null ? 'none' : e.score.toFixed(0)) + ', ' : '') + 'held-out error ' + desk.amount(e.holdout_rms_m, desk.told.unit)));
+    line.append(make('small', {}, (length ? 'score ' + (e.score === null ? 'none' : e.score.toFixed(0)) + ', ' : '') + 'held-out error ' + desk.amount(e.holdout_rms_m, desk.setup.unit)));
     if (key === tree.best) { line.append(make('small', {}, e.state === 'best' ? 'the answer' : 'best so far')); }
     var own = make('li', {}, line);
     var below = Object.keys(tree.known).filter(function (k) { return k && k !== key && parent(tree.known, tree.known[k].causes) === key; });
@@ -83,7 +83,7 @@ desk.search = (function () {
       var less = tree.known[named(node.causes.filter(function (o) { return o !== c; }))];
       shares.push({name: desk.words(c), share: cut(less ? all - removes(less.last) : all / node.causes.length)});
     });
-    var said = 'Base model ' + desk.amount(e.base_rms_m, desk.told.unit) + ', best so far ' + desk.amount(e.holdout_rms_m, desk.told.unit) + ', noise ' + desk.amount(e.noise_rms_m, desk.told.unit) +
+    var said = 'Base model ' + desk.amount(e.base_rms_m, desk.setup.unit) + ', best so far ' + desk.amount(e.holdout_rms_m, desk.setup.unit) + ', noise ' + desk.amount(e.noise_rms_m, desk.setup.unit) +
       '. Of the power above the noise:';
     return budget(shares, 1 - all, said);
   }

@@ -21,12 +21,12 @@ from psa_casadi.errors import InputError, MachineError
 from psa_casadi.report.page.document import environment, script_hash, source
 from psa_casadi.version import __version__
 from psa_casadi.workbench.desk import BusyError, Desk
-from psa_casadi.workbench.subject import Subject
+from psa_casadi.workbench.previews import Subject
 
 #: The name of the machine for itself, as addresses have it.
 HOST = "127.0.0.1"
-#: What a browser says of a request that the page itself, or nobody else's page, has caused.
-_OWN = ("same-origin", "none")
+#: Sec-Fetch-Site of a request that the page itself, or no other page, has caused.
+_SAME_SITE = ("same-origin", "none")
 _PAGE_ALONE = "Only the page itself may ask for this."
 
 
@@ -40,14 +40,14 @@ _SCRIPT = Markup(
         for name in ("begin", "columns", "files", "search", "workbench")
     )
 )
-#: What stands at the address with the token, and its only script: it leads to the page, which
+#: The page at the address with the token, and its only script: it leads to the page, which
 #: asks for all that follows, so that the token is in no address.
 _ENTER = "location.replace('/');"
 _DOOR = (
     '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records</title>'
     f"</head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script></body></html>\n"
 )
-#: What a browser is told to refuse: scripts and styles but the page's own, requests to others, a
+#: What a browser must refuse: scripts and styles but the page's own, requests to others, a
 #: frame around the page.
 _PAGE_POLICY = {
     "Content-Security-Policy": (
@@ -57,7 +57,7 @@ _PAGE_POLICY = {
     )
 }
 #: A report is a page of its own that runs its scripts and can reach nothing here, not even by the
-#: cookie; beside this its own policy holds.
+#: cookie; in addition its policy holds.
 _REPORT_POLICY = {
     "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"
 }
@@ -78,16 +78,16 @@ def page(effects: Sequence[str], subject: Subject) -> str:
     """Return the page; `effects` are those that a person may leave out of the search."""
     outputs = [subject.units[name] for name in subject.outputs]
     unit = "m" if not outputs else outputs[0] if len(outputs) == 1 else ""
-    table = {"effects": list(effects), "columns": subject.columns, "unit": unit}
+    setup_data = {"effects": list(effects), "columns": subject.columns, "unit": unit}
     template = environment().from_string(_PAGE.joinpath("workbench.html").read_text("utf-8"))
-    markup = Markup(json.dumps(table).replace("<", "\\u003c"))
+    setup = Markup(json.dumps(setup_data).replace("<", "\\u003c"))
     return template.render(
-        style=_STYLE, script=_SCRIPT, version=__version__, told=markup, stack=not outputs
+        style=_STYLE, script=_SCRIPT, version=__version__, setup=setup, stack=not outputs
     )
 
 
 class Server(ThreadingHTTPServer):
-    """Serves one desk at one port to who has the address; a request has a thread of its own.
+    """Serves one desk at one port to who has the address; each request has its thread.
 
     A token in the address opens the page, then a cookie does. The cookie is no part of an address,
     no script can read it, and a browser sends it with nothing that another site has caused. The
@@ -192,11 +192,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _look_at_cookie(self, why: str) -> None:
         """Refuse what has not the cookie, or is caused by another site."""
-        result = None
-        if self.headers.get("Sec-Fetch-Site", "none") in _OWN:
+        cookie = None
+        if self.headers.get("Sec-Fetch-Site", "none") in _SAME_SITE:
             with contextlib.suppress(CookieError):
-                result = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
-        if result is None or not _same(result.value, self.server.session):
+                cookie = SimpleCookie(self.headers.get("Cookie", "")).get(self.server.cookie)
+        if cookie is None or not _same(cookie.value, self.server.session):
             raise _RefusedError(HTTPStatus.FORBIDDEN, why)
 
     def _get(self) -> None:

@@ -11,7 +11,7 @@
       desk.post('/settings', given);
     };
   });
-  desk.told.effects.forEach(function (name) {
+  desk.setup.effects.forEach(function (name) {
     var box = make('input', {type: 'checkbox', value: name, id: 'out-' + name});
     box.onchange = function () {
       var all = Array.prototype.slice.call(el('effects').querySelectorAll('input:checked'));
@@ -28,15 +28,15 @@
     texts.forEach(function (name) {
       if (document.activeElement !== el('set-' + name)) { el('set-' + name).value = given[name]; }
     });
-    desk.told.effects.forEach(function (name) { el('out-' + name).checked = given.leave_out.indexOf(name) >= 0; });
+    desk.setup.effects.forEach(function (name) { el('out-' + name).checked = given.leave_out.indexOf(name) >= 0; });
   }
 
-  // The last line that a command has told, without what is not for people.
+  // The last message of a command, without what is not for people.
   function progress(run) {
     if (run.status === 'running') { return run.line.trim() || 'starting'; }
     var took = ' after ' + run.seconds.toFixed(0) + ' s';
     if (run.status === 'done') { return 'Done' + took + '.'; }
-    return (run.status === 'stopped' ? 'Stopped' : 'Failed') + took + '. ' + run.told.filter(function (l) {
+    return (run.status === 'stopped' ? 'Stopped' : 'Failed') + took + '. ' + run.messages.filter(function (l) {
       return !/^ *diagnosing/.test(l); }).join(' ');
   }
 
@@ -50,12 +50,12 @@
       if (run.number !== known.run) { known.run = run.number; known.events = []; }
       known.events = known.events.concat(run.events);
       desk.filled(el('progress'), progress(run), function () { return [progress(run)]; });
-      el('said').hidden = on || !run.said.length;
-      desk.filled(el('said'), run.said.join('\n'), function () { return [run.said.join('\n')]; });
+      el('printed').hidden = on || !run.printed.length;
+      desk.filled(el('printed'), run.printed.join('\n'), function () { return [run.printed.join('\n')]; });
       desk.search(known.events, on ? null : known.result && known.result.budget);
     }
     var made = state.export;
-    el('exporting').textContent = !made ? '' : made.status === 'running' ? 'compiling' : made.status === 'done' ? 'written' : made.told.join(' ');
+    el('exporting').textContent = !made ? '' : made.status === 'running' ? 'compiling' : made.status === 'done' ? 'written' : made.messages.join(' ');
     return on || out;
   }
 

@@ -401,7 +401,7 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
         psa.diagnose(oscillator(), {"time": t, "force": t})
     with pytest.raises(psa.InputError, match=r"model comes first.*psa.diagnose\(model, records\)"):
         psa.diagnose({"time": t, "force": t, "position": t}, oscillator())  # type: ignore[call-overload]
-    with pytest.raises(psa.InputError, match=r"tells a diagnosis, and this is of type Signals"):
+    with pytest.raises(psa.InputError, match=r"describes a diagnosis, and this is of type Signals"):
         psa.story(_quiet(oscillator()))  # type: ignore[arg-type]
     with pytest.raises(psa.InputError, match=r"rows are not in the order of time"):
         psa.identify(oscillator(), {"time": t[::-1], "force": t, "position": t})

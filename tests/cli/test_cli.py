@@ -18,10 +18,11 @@ from typer.testing import CliRunner
 import psa_casadi
 import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
-from psa_casadi.cli import steps
+from psa_casadi.cli import screen
 from psa_casadi.cli.app import app
-from psa_casadi.cli.screen import show_table, working
-from psa_casadi.cli.steps import DIAGNOSE, IDENTIFY, Course, Told
+from psa_casadi.cli.check import check_cases
+from psa_casadi.cli.failures import junit_text
+from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, Course, ProgressLine, show_table, working
 from psa_casadi.datasets import DATASETS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
@@ -33,7 +34,6 @@ from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record
 from psa_casadi.records.split import whole
-from psa_casadi.report.documents.junit import check_cases, junit_text
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
 from tests.contract.helpers import command, done
@@ -74,7 +74,7 @@ def test_the_playground_and_a_posterior_take_a_model(
 ) -> None:
     file, played = tmp_path / "model.json", []
     save_model(stack_model("demo"), file)
-    monkeypatch.setattr(playground, "write_playground", lambda *given: played.append(given))
+    monkeypatch.setattr(playground, "write_playground", lambda *inputs: played.append(inputs))
     assert command("web", *way, file, "-o", tmp_path / "p.html").code == 0
     ((path, model),) = played
     assert path == tmp_path / "p.html"
@@ -167,11 +167,11 @@ def test_the_checks_of_an_fmu_are_tests() -> None:
     }
 
 
-SOURCE = Path(steps.__file__).parents[1]
+SOURCE = Path(screen.__file__).parents[1]
 
 
 class Clock:
-    """A clock that stands where it is set."""
+    """A clock that shows the time it is set to."""
 
     now = 0.0
 
@@ -182,19 +182,19 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     result = Clock()
-    monkeypatch.setattr(steps, "clock", result)
+    monkeypatch.setattr(screen, "clock", result)
     return result
 
 
 def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
-    output = Told("diagnosing", DIAGNOSE)
+    output = ProgressLine("diagnosing", DIAGNOSE)
     assert output.line() == "diagnosing, 0 s (most take up to 40 s)"
     clock.now = 7.4
-    output.tell("screening effects")
+    output.update("screening effects")
     step = "diagnosing, step 3 of 6 (screening the effects)"
     assert output.line() == f"{step}, 7 s (most take up to 40 s): screening effects"
     clock.now = 130.0
-    output.tell("base fit from zero")  # parts of the work come again; the step does not go back
+    output.update("base fit from zero")  # parts of the work come again; the step does not go back
     assert output.line() == f"{step}, 2 min (longer than most: 40 s): base fit from zero"
     assert output.line(drawn=False) == output.line()
     console = Console(width=200)
@@ -206,7 +206,7 @@ def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
 def test_lines_that_stay_tell_once_what_is_usual(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with working("diagnosing", False, DIAGNOSE) as progress:
+    with working("diagnosing", DIAGNOSE) as progress:
         clock.now = 3.0
         progress("screening effects")
         clock.now = 41.0
@@ -233,7 +233,7 @@ def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> Non
 
 
 def commands(item: Any, *path: str) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield a command of click, which some versions of typer hold in a room of their own."""
+    """Yield a command of click, which some versions of typer vendor."""
     yield path, item
     for name, inner in getattr(item, "commands", {}).items():
         yield from commands(inner, *path, name)

@@ -51,7 +51,7 @@ def record() -> psa.Record:
 
 
 def at(word: str) -> Callable[[str], None]:
-    """Return a listener that interrupts where a step of the work begins."""
+    """Return a listener that interrupts where a step of the work starts."""
 
     def listen(step: str) -> None:
         if word in step:
@@ -60,7 +60,7 @@ def at(word: str) -> Callable[[str], None]:
     return listen
 
 
-def cut(*given: object, **options: object) -> None:
+def cut(*inputs: object, **options: object) -> None:
     raise KeyboardInterrupt
 
 
@@ -134,7 +134,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
 
 
 @pytest.mark.parametrize(
-    ("name", "word", "told"),
+    ("name", "word", "message"),
     [
         ("diagnose", "screening", "there is no verdict; the best fit so far is the base model"),
         ("diagnose", "writing", "the diagnosis was finished before. Kept: {m}, {j}. Not"),
@@ -144,28 +144,28 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
     ],
 )
 def test_a_command_says_what_it_kept(
-    name: str, word: str, told: str, record: psa.Record, tmp_path: Path,
+    name: str, word: str, message: str, record: psa.Record, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     for home in ("diagnose", "identify"):
         module = import_module(f"psa_casadi.cli.{home}")
-        monkeypatch.setattr(module, "working", lambda *given: nullcontext(at(word)))
+        monkeypatch.setattr(module, "working", lambda *inputs: nullcontext(at(word)))
     if word == "writing":
         finished = diagnosis("cause_named")
         module = import_module("psa_casadi.diagnosis.diagnose")
-        monkeypatch.setattr(module, "diagnose", lambda *given, **options: finished)
+        monkeypatch.setattr(module, "diagnose", lambda *inputs, **options: finished)
     psa.write_record(tmp_path / "r.csv", record)
     m, j, r = (tmp_path / n for n in ("m.json", "d.json", "r.html"))
-    given: list[str | Path] = [name, tmp_path / "r.csv", "-o", m, "--report", r, "--still"]
+    inputs: list[str | Path] = [name, tmp_path / "r.csv", "-o", m, "--report", r, "--still"]
     if name == "diagnose":
-        given += ["--json", j]
-    ended = command(*given)
+        inputs += ["--json", j]
+    ended = command(*inputs)
     assert ended.code == 130
-    assert f"Interrupted: {told.format(m=m, j=j, r=r)}" in ended.err
-    assert m.exists() == ("Kept" in told or "best fit" in told)
+    assert f"Interrupted: {message.format(m=m, j=j, r=r)}" in ended.err
+    assert m.exists() == ("Kept" in message or "best fit" in message)
     assert not r.exists()
     if m.exists():
-        cut = "finished" not in told
+        cut = "finished" not in message
         assert psa.load_model(m).provenance.interrupted == cut
 
 
@@ -195,7 +195,7 @@ def test_a_designed_voltage_is_kept_without_its_check(
 def test_files_that_stand_are_named_however_late_the_interrupt(
     record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "tell_written", cut)
+    monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "show_written", cut)
     psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
     items = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]

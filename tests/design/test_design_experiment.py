@@ -388,7 +388,7 @@ def test_the_command_writes_the_record_and_says_so(
 ) -> None:
     """The design itself is the one above: here only what becomes of it."""
     monkeypatch.setattr(experiment, "resolving_experiment", lambda d, **_: loop.design)
-    path = command._beside(tmp_path / "diagnosis.json")
+    path = command.next_voltage(tmp_path / "diagnosis.json")
     assert path == tmp_path / "diagnosis_next.csv"
     d = files.with_next(loop.ambiguous, path, lambda _: None)
     statement = json.loads(d.to_json())["next_experiment"]

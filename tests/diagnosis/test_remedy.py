@@ -127,7 +127,7 @@ def test_every_verdict_says_what_now_right_below_itself(tmp_path: Path, verdict:
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     top = " ".join(Page(text[: text.index("<h2")]).text.replace("\u00a0", " ").split())
     assert top.index("What now") < top.index("Remains:")
-    for part in (*advice.causes, *advice.beside, *advice.commands):
+    for part in (*advice.causes, *advice.remarks, *advice.commands):
         assert part in top
     export = "psa export fmu --model 'my models/e.json' -o 'my models/e.fmu'"
     assert advice.commands[:1] == ((export,) if verdict != "not_driven" else ())
@@ -139,20 +139,20 @@ def test_every_verdict_says_what_now_right_below_itself(tmp_path: Path, verdict:
 
 def test_an_undecided_cause_comes_with_its_rivals_remedy_and_the_design_of_a_record() -> None:
     advice = what_now(diagnosis("ambiguous"))
-    (rival,) = [t for t in advice.beside if "does not decide" in t]
+    (rival,) = [t for t in advice.remarks if "does not decide" in t]
     assert "offset drift: let the sensor warm up" in rival
     assert f"{RECORDS['hold']} and {RECORDS['record']}" in rival
     assert advice.commands[-1].startswith(
         "psa design experiment --model extended.json --record RECORD.csv --separate slow_creep "
     )
-    assert "psa.save_model" in advice.beside[-1]
+    assert "psa.save_model" in advice.remarks[-1]
 
 
 def test_a_cause_of_the_sensor_stays_out_of_the_exported_plant() -> None:
     d = diagnosis("cause_named")
     cause = replace(d.causes[0], effect="offset_drift", belongs_to="sensor", remedy="zero_again")
     advice = what_now(replace(d, causes=(cause,)), "e.json")
-    assert advice.beside == (
+    assert advice.remarks == (
         "An exported plant leaves out offset drift: correct the reading instead.",
     )
     assert len(advice.commands) == 1

@@ -1,7 +1,7 @@
 """Diagnoses with chosen findings, and a fit, on simulated records: what a report must show."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import get_args
 
 import numpy as np
@@ -37,11 +37,8 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
     drift = 8e-8 * time / time[-1]
     y = clean + drift + NOISE * np.random.default_rng(1).standard_normal(len(time))
     y[40:50] = np.nan
-    return (
-        split(psa.Record(name=name, time=time, voltage=voltage, displacement=y)),
-        clean,
-        clean + drift,
-    )
+    record = psa.Record(name=name, time=time, voltage=voltage, displacement=y)
+    return split(record), clean, clean + drift
 
 
 @cache
@@ -61,16 +58,9 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
     bent = 4e-8 * ((voltage - 50.0) / 50.0) ** 2 + 3e-8 * np.sin(2.0 * np.pi * 51.0 * time)
     noise = NOISE * np.random.default_rng(4).standard_normal(time.size)
     size = 1e9 if counts else 1.0
-    quiet, record = (
-        psa.Record(
-            name="loops",
-            time=time,
-            voltage=voltage,
-            displacement=size * y,
-            displacement_unit="counts" if counts else "m",
-        )
-        for y in (clean + noise, clean + bent + noise)
-    )
+    loops = partial(psa.Record, name="loops", time=time, voltage=voltage)
+    loops = partial(loops, displacement_unit="counts" if counts else "m")
+    quiet, record = (loops(displacement=size * y) for y in (clean + noise, clean + bent + noise))
     # the noise is known from before the hum began
     (floor,) = noise_floor([quiet], [size * noise])
     before, after = (misfit(record, size * e, floor) for e in (bent + noise, noise))
@@ -152,9 +142,7 @@ def diagnosis(
 @cache
 def identification() -> StackIdentification:
     """Return the fit of the base model to two short records that drift."""
-    return identify(
-        [experiment(name, n)[0].record for name, n in (("rig_a", 1500), ("rig_b", 800))]
-    )
+    return identify([experiment(*case)[0].record for case in (("rig_a", 1500), ("rig_b", 800))])
 
 
 def long_fit(records: int, samples: int) -> tuple[StackIdentification, tuple[Series, ...]]:

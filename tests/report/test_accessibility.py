@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from psa_casadi.report.page.results import write_fit_report, write_report
 from tests.report.browser import DARK, MOUSE, Browser
-from tests.report.report_cases import diagnosis, identification
+from tests.report.test_report_browser import report_page
 from tests.tiers import slow
 
 pytestmark = pytest.mark.xdist_group("browser")
@@ -33,11 +32,7 @@ SITE = (
 @slow
 @pytest.mark.parametrize("name", ["fit", "diagnosis"])
 def test_a_report_has_no_serious_fault(name: str, browser: Browser, tmp_path: Path) -> None:
-    page = tmp_path / f"{name}.html"
-    if name == "fit":
-        write_fit_report(identification(), page)
-    else:
-        write_report(diagnosis("cause_named", ("rig_a", "rig_b")), page)
+    page = report_page(name, tmp_path)
     assert browser.serious_faults(page, *([DARK] if name == "fit" else [])) == []
 
 

@@ -33,7 +33,7 @@ NASTY = "<img src=x onerror=alert(1)>"
 
 
 @pytest.fixture(scope="module")
-def shown() -> psa.StackDiagnosis:
+def case() -> psa.StackDiagnosis:
     """A diagnosis of two records, of a name that is no HTML; an unnamed correction adds 20 nm."""
     d = diagnosis("cause_named", ("rig_a", "rig_b"))
     first = d.experiments[0]
@@ -42,14 +42,14 @@ def shown() -> psa.StackDiagnosis:
 
 
 @pytest.fixture(scope="module")
-def page(shown: psa.StackDiagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page(case: psa.StackDiagnosis, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "page.html"
-    psa.write_report(shown, path)
+    psa.write_report(case, path)
     return path
 
 
 def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
-    """Return the held-out rms [nm] of the first record at other values, the offset found again."""
+    """Return the held-out rms [nm] of the first record at other values, with a new offset."""
     e, fit = d.experiments[0], d.extended_fit
     model = d.model.with_values(values)
     trajectory = psa.simulate_record(
@@ -68,7 +68,7 @@ def moved(browser: Browser, page: Path) -> dict[str, Any]:
     return table
 
 
-def told_rms(text: str) -> float:
+def rms_in(text: str) -> float:
     result = re.search(r"held-out samples: ([\d.e+-]+) (nm|µm) rms", text)
     assert result is not None, text
     return float(result[1]) * (1e3 if result[2] == "µm" else 1.0)
@@ -76,28 +76,28 @@ def told_rms(text: str) -> float:
 
 @slow
 def test_a_moved_slider_shows_what_python_simulates(
-    moved: dict[str, Any], shown: psa.StackDiagnosis
+    moved: dict[str, Any], case: psa.StackDiagnosis
 ) -> None:
-    names = shown.model.parameter_names
+    names = case.model.parameter_names
     at = dict(zip(names, moved["values"], strict=True))
-    changed = {n: v for n, v in at.items() if v != shown.model.values[n]}
+    changed = {n: v for n, v in at.items() if v != case.model.values[n]}
     assert list(changed) == ["k_L"]
     assert changed["k_L"] == pytest.approx(100.0**0.62, rel=1e-9)  # from 1 to 100
-    assert told_rms(moved["moved"]) == pytest.approx(rms_of(shown, changed), rel=6e-3)
-    assert told_rms(moved["first"]) == pytest.approx(rms_of(shown, {}), rel=6e-3)
+    assert rms_in(moved["moved"]) == pytest.approx(rms_of(case, changed), rel=6e-3)
+    assert rms_in(moved["first"]) == pytest.approx(rms_of(case, {}), rel=6e-3)
     assert moved["changed"]
     assert "% is removed" in moved["first"]
     assert "more than the base model leaves" in moved["moved"]
 
 
 @slow
-def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
+def test_the_error_budget_follows(moved: dict[str, Any], case: psa.StackDiagnosis) -> None:
     assert moved["fitted"] == []  # no effect is on
-    at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
+    at = dict(zip(case.model.parameter_names, moved["then"], strict=True))
     values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
-    noise = 1e9 * shown.noise_floor_rms_m  # the levels of both records are the same
+    noise = 1e9 * case.noise_floor_rms_m  # the levels of both records are the same
     now, without = (
-        rms_of(shown, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
+        rms_of(case, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
     )
     name, size, share = moved["budget"]
     number, unit = size.split()
@@ -109,12 +109,12 @@ def test_the_error_budget_follows(moved: dict[str, Any], shown: psa.StackDiagnos
 
 
 @slow
-def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
-    at = dict(zip(shown.model.parameter_names, moved["then"], strict=True))
+def test_switches_numbers_and_reset_work(moved: dict[str, Any], case: psa.StackDiagnosis) -> None:
+    at = dict(zip(case.model.parameter_names, moved["then"], strict=True))
     assert at["tau"] == pytest.approx(2.5e-4, rel=1e-12)
     assert at["creep_gain"] > 0.0
     values = {n: at[n] for n in ("k_L", "tau", "creep_gain")}
-    assert told_rms(moved["switched"]) == pytest.approx(rms_of(shown, values), rel=6e-3)
+    assert rms_in(moved["switched"]) == pytest.approx(rms_of(case, values), rel=6e-3)
     assert moved["reset"] == moved["first"]
     assert moved["again"]
     low, high = moved["reach"]
@@ -123,28 +123,28 @@ def test_switches_numbers_and_reset_work(moved: dict[str, Any], shown: psa.Stack
 
 @slow
 def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
-    browser: Browser, shown: psa.StackDiagnosis, tmp_path: Path
+    browser: Browser, case: psa.StackDiagnosis, tmp_path: Path
 ) -> None:
-    model = shown.model.with_values({"creep_gain": 0.02})
-    psa.write_report(replace(shown, model=model), tmp_path / "on.html")
+    model = case.model.with_values({"creep_gain": 0.02})
+    psa.write_report(replace(case, model=model), tmp_path / "on.html")
     statement = driven(browser, tmp_path / "on.html", """
       var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
       box.psa.set('creep_gain', 0);
       tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
     assert "nothing is fitted again" not in statement[0]
     assert "With slow creep off nothing is fitted again: all other values were" in statement[1]
-    e = shown.experiments[0]
-    miss = (measured(e.record) - shown.base[0])[e.held_out & np.isfinite(measured(e.record))]
+    e = case.experiments[0]
+    miss = (measured(e.record) - case.base[0])[e.held_out & np.isfinite(measured(e.record))]
     base = 1e9 * float(np.sqrt(np.mean(miss**2)))
     assert f"The base model, fitted without any effect, leaves {base:.3g} nm." in statement[1]
 
 
 @slow
-def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], shown: psa.StackDiagnosis) -> None:
+def test_the_model_file_of_a_page_is_read(moved: dict[str, Any], case: psa.StackDiagnosis) -> None:
     model = loads(moved["file"])
     assert model.parameter_vector().tolist() == moved["values"]
     assert "k_L" not in model.provenance.intervals
-    assert model.provenance.intervals["tau"] == shown.model.provenance.intervals["tau"]
+    assert model.provenance.intervals["tau"] == case.model.provenance.intervals["tau"]
     assert "by hand" in model.provenance.notes[-1]
 
 
@@ -192,11 +192,11 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
 
 @slow
 def test_without_compiler_a_page_says_so(
-    shown: psa.StackDiagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    case: psa.StackDiagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
     monkeypatch.setattr(live, "has_zig", lambda: False)
-    psa.write_report(shown, tmp_path / "page.html")
+    psa.write_report(case, tmp_path / "page.html")
     text = Page((tmp_path / "page.html").read_text(encoding="utf-8")).text
     assert "the model does not run. It takes a compiler" in text
 
@@ -235,7 +235,7 @@ def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> Non
 def test_a_model_of_ones_own_runs_in_its_page(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every output of a record beside the model, at values that are moved, as Python has them."""
+    """Every output of a record and the model, at other values, as Python has them."""
     record = plants.motor(1, friction=0.0)
     result = psa.identify(own_models.motor(), record, starts=1)
     psa.write_fit_report(result, tmp_path / "page.html")

@@ -1,4 +1,4 @@
-"""What every page says of its making, its one unit for errors, and the page that is small."""
+"""The origin that every page states, its shared arrays, and the sentences of notes."""
 
 import ast
 import base64

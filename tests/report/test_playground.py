@@ -1,4 +1,4 @@
-"""The playground: every effect on one page, any voltage, and what it tells is what Python says."""
+"""The playground: every effect on one page, any voltage, with the figures of Python."""
 
 import base64
 import csv

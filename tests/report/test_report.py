@@ -63,11 +63,11 @@ def test_the_window_shows_where_the_error_falls_most() -> None:
     assert s.held_out[window].all()
     assert 48 <= len(base[window]) <= len(base) // 8
 
-    def shown(part: slice) -> float:
+    def error_drop(part: slice) -> float:
         errors = [float(np.sqrt(np.mean(e[part] ** 2))) for e in (base, extended)]
         return (errors[0] - errors[1]) / float(np.ptp(reached[part]))
 
-    assert shown(window) > 2 * shown(slice(None))
+    assert error_drop(window) > 2 * error_drop(slice(None))
 
 
 def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
@@ -196,7 +196,7 @@ _SKEWED, _HEAVY = _RNG.exponential(size=20_000) - 1.0, _RNG.laplace(size=20_000)
 
 
 @pytest.mark.parametrize(
-    ("residual", "figure", "wanted", "said"),
+    ("residual", "figure", "wanted", "words"),
     [
         (white(20_000), "rms", (1e-9, 2e-11), "is as white as noise"),
         (white(20_000), "beyond_three", (0.0027, 0.0012), "close to normal"),
@@ -208,12 +208,12 @@ _SKEWED, _HEAVY = _RNG.exponential(size=20_000) - 1.0, _RNG.laplace(size=20_000)
     ],
 )
 def test_a_residual_is_called_what_it_is(
-    residual: FloatArray, figure: str, wanted: tuple[float, float], said: str
+    residual: FloatArray, figure: str, wanted: tuple[float, float], words: str
 ) -> None:
     result = figures_of(residual)
     assert getattr(result, figure) == pytest.approx(wanted[0], abs=wanted[1])
     sentence = residual_sentence(result, "base model", Scale("s", 1.0))
-    assert said in sentence
+    assert words in sentence
     assert figure != "lasting" or f"that of noise after {result.lasting:.2f} s" in sentence
 
 

@@ -22,16 +22,16 @@ BLUE = np.array([0x00, 0x72, 0xB2]) / 255.0
 
 @pytest.fixture(scope="module", params=slow_but(["diagnosis"], PAGES))
 def page(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return _written(request.param, tmp_path_factory.mktemp("pages"))
+    return report_page(request.param, tmp_path_factory.mktemp("pages"))
 
 
 @pytest.fixture(scope="module")
 def of_diagnosis(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The longer page, for what both have by the same style sheet and scripts."""
-    return _written("diagnosis", tmp_path_factory.mktemp("page"))
+    return report_page("diagnosis", tmp_path_factory.mktemp("page"))
 
 
-def _written(kind: str, folder: Path) -> Path:
+def report_page(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
         result = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))

@@ -32,7 +32,7 @@ def shipped(name: str) -> dict[str, Any]:
 
 
 def valid(name: str, text: str) -> dict[str, Any]:
-    """Return what a JSON text holds, which must be as its shipped schema says."""
+    """Return what a JSON text holds, which must match its shipped schema."""
     content: dict[str, Any] = json.loads(text)
     jsonschema.Draft202012Validator(shipped(name)).validate(content)
     return content
@@ -80,22 +80,17 @@ def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
 
 
 def test_identifications_are_as_their_schema_says() -> None:
-    stack_identification = identification()
-    k = stack_identification.determinacy.names[0]
+    fitted = identification()
+    k = fitted.determinacy.names[0]
     profile = Profile(k, "N/m", "N/um", True, (0, 1), 1.0, 0.1, np.ones(2), np.ones(2), 0.9, None)
-    content = valid(
-        "identification", json_text(identification_file(stack_identification, [profile]))
-    )
-    interval = stack_identification.model.provenance.intervals[k]
+    content = valid("identification", json_text(identification_file(fitted, [profile])))
+    interval = fitted.model.provenance.intervals[k]
     assert content["parameters"][k]["interval"] == [interval.low, interval.high]
     assert content["profiles"][k] == {"unit": "N/m", "estimate": 1.0, "low": 0.9, "high": None}
-    (e, *_) = stack_identification.experiments
+    (e, *_) = fitted.experiments
     assert content["records"][0]["sha256"] == e.record.sha256
     assert content["records"][0]["rms_m"] == pytest.approx(content["rms_m"], rel=0.5)
-    assert (
-        valid("identification", json_text(identification_file(stack_identification)))["profiles"]
-        == {}
-    )
+    assert valid("identification", json_text(identification_file(fitted)))["profiles"] == {}
 
 
 def test_checks_are_as_their_schema_says() -> None:

@@ -1,6 +1,6 @@
-"""Every word and curve of pages and stories of results, as they were accepted in `told`.
+"""Every word and curve of pages and stories of results, against the accepted files in `told`.
 
-`python -m tests.report.test_told` accepts what is told now: look at what git says has changed.
+`python -m tests.report.test_told` accepts the texts as they are now: look at the difference in git.
 """
 
 import difflib
@@ -18,7 +18,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.diagnosis.corrections import Estimate
 from psa_casadi.diagnosis.held_out import Errors, Share, StackBudget
-from psa_casadi.diagnosis.result import BlindSpot, Cause
+from psa_casadi.diagnosis.result import BlindSpot, Cause, Verdict
 from psa_casadi.identification.advice import Advice
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.identification.identify import StackIdentification
@@ -65,38 +65,24 @@ def rival(*names: str) -> psa.StackDiagnosis:
 
 def graded() -> StackIdentification:
     """Return a fit whose parameters are known well, weakly, not at all, and only in pairs."""
-    stack_identification = identification()
-    errors = {n: 0.01 * stack_identification.model.values[n] for n in ("k_L", "tau", "R_s", "c_P")}
+    fitted = identification()
+    model, determinacy = fitted.model, fitted.determinacy
+    errors = {n: 0.01 * model.values[n] for n in ("k_L", "tau", "R_s", "c_P")}
     errors["tau"] *= 20.0
-    errors["A"] = 0.3 * stack_identification.model.parameter("A").typical(
-        stack_identification.model.values
-    )
-    matrix = np.eye(len(stack_identification.determinacy.names))
+    errors["A"] = 0.3 * model.parameter("A").typical(model.values)
+    matrix = np.eye(len(determinacy.names))
     for (a, b), r in {(0, 1): -0.97, (2, 3): 0.99, (0, 3): 0.94}.items():
         matrix[a, b] = matrix[b, a] = r
-    known = replace(
-        stack_identification.determinacy,
-        standard_errors=errors,
-        undetermined=("R_s",),
-        on_bound=("c_P",),
-        correlations=matrix,
-    )
-    return replace(stack_identification, determinacy=known)
+    known = replace(determinacy, undetermined=("R_s",), on_bound=("c_P",))
+    known = replace(known, standard_errors=errors, correlations=matrix)
+    return replace(fitted, determinacy=known)
 
 
 def not_fitted() -> StackIdentification:
-    stack_identification = identification()
-    none = replace(
-        stack_identification.determinacy,
-        names=(),
-        intervals={},
-        standard_errors={},
-        undetermined=(),
-        on_bound=(),
-        covariance=np.zeros((0, 0)),
-        correlations=np.zeros((0, 0)),
-    )
-    return replace(stack_identification, determinacy=none)
+    empty: dict[str, Any] = dict.fromkeys(("covariance", "correlations"), np.zeros((0, 0)))
+    empty |= dict.fromkeys(("names", "undetermined", "on_bound"), ())
+    empty |= {"intervals": {}, "standard_errors": {}}
+    return replace(identification(), determinacy=replace(identification().determinacy, **empty))
 
 
 def wide(d: psa.StackDiagnosis) -> psa.StackDiagnosis:
@@ -108,35 +94,35 @@ def wide(d: psa.StackDiagnosis) -> psa.StackDiagnosis:
     )  # fmt: skip
 
 
-#: What is told in full.
+#: Results whose texts are kept in full.
 WHOLE: dict[str, Callable[[], Result]] = {
     **{v: partial(diagnosis, v) for v in VERDICTS},
     "fit": lambda: replace(identification(), doubts=(), starts=(), combinations=(), advice=()),
 }
-#: What differs from one of those.
-OTHERWISE: dict[str, tuple[str, Callable[[], Result]]] = {
+Other = tuple[str, Callable[[], Result]]
+
+
+def other(verdict: Verdict, **changes: Any) -> Other:
+    """Return a verdict, and what makes a diagnosis of it that has other fields."""
+    return verdict, lambda: replace(diagnosis(verdict), **changes)
+
+
+#: Results of which the difference from one of those is kept.
+OTHERWISE: dict[str, Other] = {
     "two records": ("cause_named", lambda: diagnosis("cause_named", ("rig_a", "rig_b"))),
     "a periodic voltage": ("cause_named", lambda: with_periodic(diagnosis("cause_named"))),
     "counts": ("cause_named", lambda: with_periodic(diagnosis("cause_named"), counts=True)),
     "one unit": ("cause_named", lambda: wide(diagnosis("cause_named"))),
-    "no views": (
-        "cause_named",
-        lambda: replace(diagnosis("cause_named"), misfit=(), remainder=(), noise=()),
-    ),
+    "no views": other("cause_named", misfit=(), remainder=(), noise=()),
     "kept without a name": (
         "unexplained",
         lambda: replace(
             diagnosis("cause_named"), verdict="unexplained", causes=(), budget=shares(0.57)
         ),
     ),
-    "stand-ins": (
-        "ambiguous", lambda: replace(diagnosis("ambiguous"), budget=shares(0.05, 0.04)),
-    ),
-    "adds error": ("ambiguous", lambda: replace(diagnosis("ambiguous"), budget=shares(-0.1))),
-    "adds error twice": (
-        "ambiguous",
-        lambda: replace(diagnosis("ambiguous"), budget=shares(-0.1, -0.1, together=-0.1)),
-    ),
+    "stand-ins": other("ambiguous", budget=shares(0.05, 0.04)),
+    "adds error": other("ambiguous", budget=shares(-0.1)),
+    "adds error twice": other("ambiguous", budget=shares(-0.1, -0.1, together=-0.1)),
     "many rivals": ("ambiguous", lambda: rival(*(f"effect_{k}" for k in range(9)))),
     "no rival": (
         "cause_named",
@@ -186,7 +172,7 @@ def _shown(trace: dict[str, Any]) -> str:
     return f"{result.size} points from {np.nanmin(result):.3g} to {np.nanmax(result):.3g}"
 
 
-def told(result: Result) -> list[str]:
+def lines_of(result: Result) -> list[str]:
     """Return the lines of a result's story and page, which loads nothing, and its curves."""
     if isinstance(result, StackIdentification):
         lines = identification_text(result).splitlines()
@@ -211,23 +197,23 @@ def place(name: str) -> Path:
 
 
 @cache
-def now(name: str) -> list[str]:
-    """Return what is told of a case."""
+def lines_now(name: str) -> list[str]:
+    """Return the lines of a case, or how they differ from those of another one."""
     if name in WHOLE:
-        return told(WHOLE[name]())
+        return lines_of(WHOLE[name]())
     like, make = OTHERWISE[name]
-    changes = difflib.unified_diff(now(like), told(make()), n=0, lineterm="")
+    changes = difflib.unified_diff(lines_now(like), lines_of(make()), n=0, lineterm="")
     return [line for line in list(changes)[2:] if not line.startswith("@@")]
 
 
 _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
 
 
-def alike(found: str, accepted: str) -> bool:
+def is_same(line: str, accepted: str) -> bool:
     """Whether two lines have the same words, and numbers equal but for one in the last digit."""
-    if _NUMBER.sub("#", found) != _NUMBER.sub("#", accepted):
+    if _NUMBER.sub("#", line) != _NUMBER.sub("#", accepted):
         return False
-    pairs = zip(_NUMBER.findall(found), _NUMBER.findall(accepted), strict=True)
+    pairs = zip(_NUMBER.findall(line), _NUMBER.findall(accepted), strict=True)
     return all(a == b or abs(_value(a) - _value(b)) <= 1.01 * _last_digit(b) for a, b in pairs)
 
 
@@ -241,21 +227,21 @@ def _last_digit(number: str) -> float:
 
 
 @pytest.mark.parametrize("name", [*WHOLE, *OTHERWISE])
-def test_what_is_told_is_what_was_accepted(name: str) -> None:
+def test_texts_are_as_they_were_accepted(name: str) -> None:
     accepted = place(name).read_text("utf-8").splitlines()
-    texts = now(name)
-    if len(texts) != len(accepted) or not all(map(alike, texts, accepted)):
+    texts = lines_now(name)
+    if len(texts) != len(accepted) or not all(map(is_same, texts, accepted)):
         change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "found", lineterm=""))
         pytest.fail(f"{change}\nIf this is meant: python -m tests.report.test_told")
 
 
 def test_other_words_and_numbers_are_noticed() -> None:
-    assert alike("falls by 84 % (0.0512 um)", "falls by 83 % (0.0511 um)")
-    assert not alike("falls by 85 %", "falls by 83 %")
-    assert not alike("1.00e-3 N", "1.00e-4 N")
-    assert not alike("slow creep", "slow_creep")
+    assert is_same("falls by 84 % (0.0512 um)", "falls by 83 % (0.0511 um)")
+    assert not is_same("falls by 85 %", "falls by 83 %")
+    assert not is_same("1.00e-3 N", "1.00e-4 N")
+    assert not is_same("slow creep", "slow_creep")
 
 
 if __name__ == "__main__":
     for case in (*WHOLE, *OTHERWISE):
-        place(case).write_text("\n".join(now(case)) + "\n", encoding="utf-8")
+        place(case).write_text("\n".join(lines_now(case)) + "\n", encoding="utf-8")

@@ -10,7 +10,7 @@ import typer
 
 from psa_casadi import InputError
 from psa_casadi.cli.failures import guarded
-from psa_casadi.cli.screen import Quiet, show, show_table, tell_written, working
+from psa_casadi.cli.screen import Quiet, set_quiet, show, show_table, show_written, working
 from psa_casadi.report.words.tables import Table
 from tests.studies.benchmarks.table import BENCHES, bench
 
@@ -41,18 +41,19 @@ def study(
         return
     if name not in BENCHES:
         raise InputError(f"There is no benchmark '{name}'; there are {', '.join(BENCHES)}.")
+    set_quiet(quiet)
     run = bench(name)
     options = {"folder": folder, "size": size, "only": only, "seed": seed}
     table = {k: v for k, v in options.items() if v is not None}
     for option in table:
         if option not in signature(run).parameters:
             raise InputError(f"--{option}: '{name}' takes none; the list of benchmarks says which.")
-    with working(f"benchmark {name}", quiet) as progress:
+    with working(f"benchmark {name}") as progress:
         outcome = run(progress, quick, **table)
     for titled in outcome.tables:
-        show(f"\n{titled.title}\n", quiet)
-        show_table(titled.table, quiet)
-        show(f"\n{titled.note}" if titled.note else "", quiet)
+        show(f"\n{titled.title}\n")
+        show_table(titled.table)
+        show(f"\n{titled.note}" if titled.note else "")
     if json_file is not None:
         content = [{"title": t.title, "rows": t.rows, "note": t.note} for t in outcome.tables]
         json_file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", "utf-8")
@@ -60,7 +61,7 @@ def study(
         if outcome.picture is None:
             raise InputError("This benchmark has no picture; leave --figure out.")
         outcome.picture().savefig(figure, dpi=150, format="png")
-    tell_written(figure, json_file, quiet=quiet)
+    show_written(figure, json_file)
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -1,4 +1,4 @@
-"""Stands for the command `psa` in tests of the workbench: a real process with the same habits."""
+"""A substitute for the command `psa` in tests of the workbench: a real process like it."""
 
 import json
 import sys

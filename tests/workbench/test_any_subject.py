@@ -1,4 +1,4 @@
-"""The page on a model of one's own: an FMU, whose records have other columns than a stack's."""
+"""The page on an FMU, whose records have other columns than a stack."""
 
 import base64
 import signal
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.web import _subject
 from psa_casadi.workbench.desk import Desk
@@ -23,7 +23,7 @@ FREE = ["area=0.1:4", "outlet=0.001:0.01"]
 
 
 def _desk(folder: Path, fitting: Fitting, module: str) -> Desk:
-    model = own_model(Given(), None, fitting)
+    model = own_model(Inputs(), None, fitting)
     (folder / "desk").mkdir()
     return Desk(folder / "desk", [], subject=_subject(model, None, fitting), module=module)
 
@@ -44,7 +44,7 @@ def test_the_columns_are_those_of_the_fmu(tmp_path: Path) -> None:
         tab = Tab(server).enter()
         page = tab.ask("GET", "/")[2].decode()
         assert "level" in page
-        assert "charge" not in page.partition('id="told">')[2]
+        assert "charge" not in page.partition('id="page-data">')[2]
         assert tab.give("model.json", b"{}") == 400
         assert tab.give("run.csv", _measured(tmp_path)) == 200
         observed = tab.state()["items"][0]["seen"]

@@ -16,12 +16,12 @@ from urllib.parse import quote
 import pytest
 
 from psa_casadi.cli import web
-from psa_casadi.cli.inputs import Given
+from psa_casadi.cli.inputs import Inputs
 from psa_casadi.errors import InputError
 from psa_casadi.workbench.desk import Desk, Limits, stored_name
+from psa_casadi.workbench.previews import Subject
 from psa_casadi.workbench.run import Run
 from psa_casadi.workbench.server import Server, served
-from psa_casadi.workbench.subject import Subject
 from tests.contract.test_commands import request
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
@@ -30,7 +30,7 @@ SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for
 
 
 class Tab:
-    """A browser's tab, as far as the server sees one; `cookie` is what the door has given."""
+    """A browser's tab, as the server sees it; `cookie` comes from the first page."""
 
     def __init__(self, server: Server) -> None:
         self.server, self.port = server, server.port
@@ -184,7 +184,7 @@ def test_a_stopped_run_keeps_what_it_has_and_can_begin_again(tab: Tab) -> None:
     assert tab.post("/stop") == 200
     state = tab.until("stopped")
     assert set(state["files"]) == {"extended.json"}
-    assert state["run"]["told"][-1] == "Interrupted: kept."
+    assert state["run"]["messages"][-1] == "Interrupted: kept."
     assert tab.post("/start") == 200
     assert tab.until("running")["run"]["number"] == 2
 
@@ -333,6 +333,6 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
         for modules in ([], ["gratings"]):
             monkeypatch.setattr(sys, "path", [first, *sys.path])
             with pytest.raises(InputError, match="no server"):
-                web._serve(0, True, Subject(), Given(effects=modules))
+                web._serve(0, True, Subject(), Inputs(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])

@@ -1,4 +1,4 @@
-"""The local page as people use it: a record is given, columns are mapped, the verdict is read."""
+"""The local page in use: choose a record, map its columns, read the verdict."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ HOSTILE = "<img src=x onerror=document.title=1>.csv"
 #: Leaves of the page what was tried, the verdict, and the top of the report.
 _FROM_THE_SEARCH = """
   var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
-    + ' #h-run, #said, #downloads, #result .bar';
+    + ' #h-run, #printed, #downloads, #result .bar';
   document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
   document.querySelector('#report').style.height = '740px';
   scrollTo(0, 0);
@@ -97,7 +97,7 @@ def narrow(tab: Steered) -> None:
 
 
 def of_another_layout(tab: Steered, path: Path, line: str) -> None:
-    """Choose a file whose columns have other names: they are said of it alone, and go with it."""
+    """Choose a file whose columns have other names, which are mapped for it alone."""
     rows = ["time [s],voltage [V],pos", *DEMO.read_text(encoding="utf-8").splitlines()[1:300]]
     path.write_text("\n".join(rows), encoding="utf-8")
     tab.choose("#pick", path)

@@ -122,10 +122,10 @@ def damage(folder: Path, device_file: DeviceFile) -> str:
     for name, sha256 in zip(device_file.files, device_file.sha256, strict=False):
         path = folder / name
         try:
-            text = hash_of(path.read_bytes())
+            digest = hash_of(path.read_bytes())
         except OSError as error:
             return f"{path}: cannot be read ({error.strerror}); run `psa batch` again."
-        if text != sha256:
+        if digest != sha256:
             return f"{path}: is damaged, as it is not what was written; run `psa batch` again."
     return ""
 
@@ -135,13 +135,13 @@ def hash_of(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-class Told(Lined):
-    """A diagnosis as its file tells it: shows itself, and is written again as it was read."""
+class ResultFile(Lined):
+    """A result as its file has it: shows itself, and is written again as it was read."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the file; what this version does not know is left out."""
-        table: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
-        return table
+        content: dict[str, Any] = json.loads(json.dumps(asdict(self)))  # type: ignore[call-overload]
+        return content
 
     def to_json(self) -> str:
         """Return the text of the file."""
@@ -282,7 +282,7 @@ class FreeCorrection:
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
-class AnyDiagnosisFile(Told):
+class AnyDiagnosisFile(ResultFile):
     """A diagnosis: verdict, causes, what the base misses and what remains.
 
     It answers by the names of a result what needs no samples and no model. `values` are the
@@ -423,7 +423,7 @@ class IdentificationFile:
     noise_kinds: tuple[NoiseFound, ...] = ()
 
 
-#: The doubts that tell it, and the name of the figure in each.
+#: The codes of the doubts that state this misfit, and the name of the figure in each.
 _MISSED = {"missed": "times", "output_missed": "ratio"}
 
 
@@ -431,55 +431,42 @@ def identification_file(
     identification: Identification, profiles: Iterable[Profile] = ()
 ) -> dict[str, Any]:
     """Return what `--json` writes of an identification, of any model."""
-    intervals = identification.model.provenance.intervals
-    parameters = {
-        p.name: FoundParameter(
-            identification.model.values[p.name],
-            p.unit,
-            (i.low, i.high) if (i := intervals.get(p.name)) is not None else None,
-            grade(identification, p.name).degree,
-            p.description,
-        )
-        for p in identification.model.structure.parameters
-    }
+    model, fit, parameters = identification.model, identification.fit, {}
+    for p in model.structure.parameters:
+        i, degree = model.provenance.intervals.get(p.name), grade(identification, p.name).degree
+        interval = None if i is None else (i.low, i.high)
+        fields = model.values[p.name], p.unit, interval, degree, p.description
+        parameters[p.name] = FoundParameter(*fields)
     stack = identification if isinstance(identification, StackIdentification) else None
     records = []
-    for output in identification.fit.channels:
+    for output in fit.channels:
         j, channel = output.number, output.channel
+        if channel.factors:
+            continue
         for k, part in zip(output.records, output.parts, strict=True):
-            if channel.factors:
-                continue
-            e, sigma = identification.experiments[k], identification.fit.sigma[k]
+            e = identification.experiments[k]
             rms = float(np.sqrt(np.mean(part**2))) * e.share(j)
-            if stack is None:
-                sigma = identification.noise[channel.column] * e.share(j)
-            readings = e.measured(j)[e.at(j, e.record.mask)]
-            share = 100.0 * rms / float(np.ptp(readings))
-            records.append(
-                FittedRecord(
-                    e.record.name, e.record.sha256, len(part), rms, float(sigma), share,
-                    channel.column, channel.unit,
-                )
-            )  # fmt: skip
+            sigma = fit.sigma[k] if stack else identification.noise[channel.column] * e.share(j)
+            share = 100.0 * rms / float(np.ptp(e.measured(j)[e.at(j, e.record.mask)]))
+            row = e.record.name, e.record.sha256, len(part), rms, float(sigma), share
+            records.append(FittedRecord(*row, channel.column, channel.unit))
     doubts = [d for d in identification.doubts if isinstance(d, Note) and d.code in _MISSED]
-    items = [float(d.values[_MISSED[d.code]]) for d in doubts]
+    advice = stack.advice if stack else ()
+    misses = [float(d.values[_MISSED[d.code]]) for d in doubts]
     content = IdentificationFile(
         format=IDENTIFICATION_FORMAT,
         package_version=__version__,
-        model=identification.model.name,
+        model=model.name,
         parameters=parameters,
-        rms_m=identification.fit.rms,
-        converged=identification.fit.converged,
+        rms_m=fit.rms,
+        converged=fit.converged,
         interrupted=identification.interrupted,
         records=tuple(records),
         warnings=identification.warnings,
         notes=identification.sentences,
-        advice=tuple(
-            AdvisedRecord(a.sentence, a.parameters, a.repeats)
-            for a in (stack.advice if stack else ())
-        ),
+        advice=tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in advice),
         profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
-        missed=max(items, default=None),
+        missed=max(misses, default=None),
         noise_kinds=identification.noise_kinds,
     )
     return asdict(content)
@@ -544,14 +531,12 @@ class PosteriorFile:
 def posterior_file(posterior: Posterior) -> dict[str, Any]:
     """Return what `--json` writes of a posterior."""
     task = posterior.task
-    records = tuple(
-        SampledRecord(
-            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
-            task.channel(b).column, task.channel(b).unit,
-        )
-        for b in task.density.blocks
-        for e in (task.experiments[b.record],)
-    )  # fmt: skip
+    records = []
+    for b in task.density.blocks:
+        e, channel = task.experiments[b.record], task.channel(b)
+        samples = int(e.at(b.channel).sum())
+        row = e.record.name, e.record.sha256, samples, b.alike, b.level
+        records.append(SampledRecord(*row, channel.column, channel.unit))
     parameters = {
         f.name: SampledParameter(
             f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
@@ -568,7 +553,7 @@ def posterior_file(posterior: Posterior) -> dict[str, Any]:
         draws=posterior.draws,
         seed=posterior.seed,
         divergences=posterior.divergences,
-        records=records,
+        records=tuple(records),
         warnings=posterior.warnings,
         notes=posterior.sentences,
     )
@@ -590,20 +575,20 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     """Return what DIAGNOSIS.json holds: verdict, causes, errors by the names of a `StackDiagnosis`.
 
     The file has no samples and no model (`load_model` reads that); to keep a whole result, pickle
-    it. A diagnosis of an own model gives what `Diagnosis` names so.
+    it. A diagnosis of another model answers by the names of `Diagnosis`.
 
     Raises InputError for a file that cannot be read, is none of a diagnosis, or lacks something.
     """
     source = os.fspath(path)
     content = read_json(source, f"{_READ_ADVICE}.")
-    output, result = diagnosis_in(content, source)
-    if output is None:
-        raise InputError(f"{source}: its format is {shown(result)}, no diagnosis; {_READ_ADVICE}.")
-    return output
+    diagnosis, kind = diagnosis_in(content, source)
+    if diagnosis is None:
+        raise InputError(f"{source}: its format is {shown(kind)}, no diagnosis; {_READ_ADVICE}.")
+    return diagnosis
 
 
 def diagnosis_in(content: Any, source: str) -> tuple[DiagnosisFile | OwnModelFile | None, Any]:
     """Return the diagnosis that a file's content is, None if it is none, and its format."""
-    result = content.get("format") if isinstance(content, dict) else None
-    kind = DIAGNOSES.get(result) if isinstance(result, str) else None
-    return None if kind is None else decode(kind, content, source), result
+    name = content.get("format") if isinstance(content, dict) else None
+    kind = DIAGNOSES.get(name) if isinstance(name, str) else None
+    return None if kind is None else decode(kind, content, source), name

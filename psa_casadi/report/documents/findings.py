@@ -24,29 +24,17 @@ from psa_casadi.population.finding import (
     NamedCause,
     replayed,
 )
-from psa_casadi.report.documents.files import DEVICE_FORMAT as DEVICE
-from psa_casadi.report.documents.files import (
-    DIAGNOSES,
-    AnyDiagnosisFile,
-    DeviceFile,
-    DiagnosisFile,
-    IdentificationFile,
-    OwnModelFile,
-    damage,
-    diagnosis_in,
-    identification_file,
-)
-from psa_casadi.report.documents.files import IDENTIFICATION_FORMAT as IDENTIFICATION
+from psa_casadi.report.documents import files
 from psa_casadi.strict_json import decode, read_json
 
-#: The file in a device's folder that says how its work ended.
+#: The file in a device's folder with the status of its work.
 DEVICE_FILE = "device.json"
 _ADVICE = "give files that `psa diagnose --json`, `psa identify --json` or `psa batch` wrote."
 #: What `identify`, `diagnose` and `load_diagnosis` return.
-Result = Diagnosis | Identification | AnyDiagnosisFile
+Result = Diagnosis | Identification | files.AnyDiagnosisFile
 #: A file, and the finding from it.
 _Read = tuple[Path, Finding]
-#: Names of files that say what is in them, not of which device.
+#: Names of files that do not name a device.
 _PLAIN_NAMES = ("diagnosis", "identification", "model", "extended")
 
 
@@ -58,11 +46,11 @@ def read_findings(
 ) -> tuple[Finding, ...]:
     """Return the findings in files, or of results at hand, in their order.
 
-    A result, of a stack or of a model of one's own, is what `identify`, `diagnose` and
+    A result, of a stack or of any other model, is what `identify`, `diagnose` and
     `load_diagnosis` return; it has the name of its first record. A path is a DIAGNOSIS.json, what
     `psa identify --json` wrote, a MODEL.json, or a device's folder of `psa batch`. A model of the
     same records as a diagnosis or identification is part of it. `traces` says whether models play
-    the records that their files carry. `effects` are own ones.
+    the records that their files carry. `effects` are a user's.
 
     Raises:
         InputError: what cannot be read, all of it.
@@ -81,72 +69,66 @@ def read_findings(
 
 def device_finding(
     folder: Path,
-    device_file: DeviceFile,
+    device_file: files.DeviceFile,
     effects: Sequence[Component] = (),
     *,
     traces: bool = False,
 ) -> Finding:
     """Return the finding in a device's folder of `psa batch`; damage is an InputError."""
-    damaged = damage(folder, device_file)
+    damaged = files.damage(folder, device_file)
     if damaged:
         raise InputError(damaged)
-    (result,) = _joined(
+    (joined,) = _joined(
         [r for name in device_file.files for r in _read(folder / name, effects, traces)]
     )
     day = date.fromisoformat(device_file.date) if device_file.date else None
-    return replace(result[1], device=device_file.device, batch=device_file.batch, day=day)
+    return replace(joined[1], device=device_file.device, batch=device_file.batch, day=day)
 
 
 def _read(
-    inputs: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
+    result: str | os.PathLike[str] | Result, effects: Sequence[Component], traces: bool
 ) -> list[_Read]:
     content: Any
-    if isinstance(inputs, AnyDiagnosisFile):
-        return [(Path(inputs.records[0].name), _diagnosis(inputs))]
-    if isinstance(inputs, Identification):
-        path, source = Path(inputs.experiments[0].record.name), "identification"
-        content = identification_file(inputs)
-    elif isinstance(inputs, Diagnosis):
-        path = Path(inputs.experiments[0].record.name)
-        content = inputs.to_dict()
-        finding = _diagnosis(decode(DIAGNOSES[content["format"]], content, "diagnosis"))
-        return [(path, _with_model(finding, _model(inputs.model, traces)))]
+    if isinstance(result, files.AnyDiagnosisFile):
+        return [(Path(result.records[0].name), _diagnosis(result))]
+    if isinstance(result, Identification):
+        path, source = Path(result.experiments[0].record.name), "identification"
+        content = files.identification_file(result)
+    elif isinstance(result, Diagnosis):
+        path = Path(result.experiments[0].record.name)
+        content = result.to_dict()
+        finding = _diagnosis(decode(files.DIAGNOSES[content["format"]], content, "diagnosis"))
+        return [(path, _with_model(finding, _model(result.model, traces)))]
     else:
-        path = Path(inputs) / DEVICE_FILE if Path(inputs).is_dir() else Path(inputs)
+        path = Path(result) / DEVICE_FILE if Path(result).is_dir() else Path(result)
         source = str(path)
         content = read_json(path, _ADVICE)
-    diagnosis, kind = diagnosis_in(content, source)
+    diagnosis, kind = files.diagnosis_in(content, source)
     if diagnosis is not None:
         return [(path, _diagnosis(diagnosis))]
-    if kind == DEVICE:
-        text = decode(DeviceFile, content, source)
-        if text.status != "done":
-            why = " ".join(text.problems)
-            raise InputError(f"{path}: the work on this device was {text.status}: {why}")
-        return [(path, device_finding(path.parent, text, effects, traces=traces))]
-    if kind == IDENTIFICATION:
-        return [(path, _identification(decode(IdentificationFile, content, source)))]
+    if kind == files.DEVICE_FORMAT:
+        device_file = decode(files.DeviceFile, content, source)
+        if device_file.status != "done":
+            why = " ".join(device_file.problems)
+            raise InputError(f"{path}: the work on this device was {device_file.status}: {why}")
+        return [(path, device_finding(path.parent, device_file, effects, traces=traces))]
+    if kind == files.IDENTIFICATION_FORMAT:
+        return [(path, _identification(decode(files.IdentificationFile, content, source)))]
     if kind == MODEL:
         return [(path, _model(model_of(content, source, effects), traces))]
     raise InputError(f"{path}: is no file of a diagnosis, identification or model; {_ADVICE}")
 
 
-def _diagnosis(d: AnyDiagnosisFile) -> Finding:
+def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
     b = d.budget
     shares = [] if b is None else [*b.causes, *([b.unnamed] if b.unnamed else [])]
     errors = []
-    if isinstance(d, DiagnosisFile):
+    if isinstance(d, files.DiagnosisFile):
         base, extended = d.base_errors, d.extended_errors
-        errors = [
-            HeldOutErrors(
-                base.holdout_rms_m,
-                extended.holdout_rms_m,
-                d.noise_floor_rms_m,
-                base.holdout_nrmse_percent,
-                extended.holdout_nrmse_percent,
-            )
-        ]
-    elif isinstance(d, OwnModelFile):
+        rms = base.holdout_rms_m, extended.holdout_rms_m, d.noise_floor_rms_m
+        percents = base.holdout_nrmse_percent, extended.holdout_nrmse_percent
+        errors = [HeldOutErrors(*rms, *percents)]
+    elif isinstance(d, files.OwnModelFile):
         errors = [
             HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
             for e in d.errors
@@ -170,7 +152,7 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
     )
 
 
-def _identification(i: IdentificationFile) -> Finding:
+def _identification(i: files.IdentificationFile) -> Finding:
     return Finding(
         device="",
         kind="identification",
@@ -188,23 +170,17 @@ def _identification(i: IdentificationFile) -> Finding:
 
 
 def _model(model: Model, traces: bool) -> Finding:
-    origin = model.provenance
-    trace = None
-    with suppress(PsaError):  # a page without this curve says more than no page
+    origin, trace, parameters = model.provenance, None, {}
+    for p in model.structure.parameters:
+        interval = (i.low, i.high) if (i := origin.intervals.get(p.name)) else None
+        fields = model.values[p.name], p.unit, interval, p.name in origin.free, p.description
+        parameters[p.name] = Found(*fields)
+    with suppress(PsaError):  # without the model's curve the page has all the rest
         trace = replayed(model) if traces else None
     return Finding(
         device="",
         kind="model",
-        parameters={
-            p.name: Found(
-                model.values[p.name],
-                p.unit,
-                (i.low, i.high) if (i := origin.intervals.get(p.name)) else None,
-                p.name in origin.free,
-                p.description,
-            )
-            for p in model.structure.parameters
-        },
+        parameters=parameters,
         records=origin.identified_from,
         force_scale=origin.force_scale,
         trace=trace,
@@ -215,17 +191,17 @@ def _joined(reads: Sequence[_Read]) -> list[_Read]:
     """Join every model to the first finding of the same records that has none yet."""
     rows = dict(enumerate(reads))
     full: set[int] = set()
-    for k, (_, item) in enumerate(reads):
+    for k, (_, model) in enumerate(reads):
         same = [
             j
             for j, (_, other) in enumerate(reads)
-            if item.kind == "model" != other.kind and j not in full
-            if item.records and {s for _, s in item.records} == {s for _, s in other.records}
+            if model.kind == "model" != other.kind and j not in full
+            if model.records and {s for _, s in model.records} == {s for _, s in other.records}
         ]
         if same:
             full.add(same[0])
             path, finding = rows[same[0]]
-            rows[same[0]] = path, _with_model(finding, item)
+            rows[same[0]] = path, _with_model(finding, model)
             del rows[k]
     return list(rows.values())
 
@@ -241,9 +217,9 @@ def _with_model(finding: Finding, model: Finding) -> Finding:
 
 
 def _named(reads: Sequence[_Read]) -> tuple[Finding, ...]:
-    """Name findings by their device, else by the shortest end of their path that is their own.
+    """Name findings by their device, else by the shortest end of their path that is unique.
 
-    A file whose name says only what it is has that of its folder.
+    A file with a usual name, such as diagnosis.json, has that of its folder.
     """
     names, depth = [], 1
     for path, finding in reads:
@@ -260,8 +236,8 @@ def _named(reads: Sequence[_Read]) -> tuple[Finding, ...]:
     out: list[Finding] = []
     for name, (_, finding) in zip(names, reads, strict=True):
         counted[name] += 1
-        item = name if counted[name] == 1 else f"{name} ({counted[name]})"
-        out.append(replace(finding, device=item))
+        unique = name if counted[name] == 1 else f"{name} ({counted[name]})"
+        out.append(replace(finding, device=unique))
     return tuple(out)
 
 
@@ -271,9 +247,9 @@ def finding_content(finding: Finding) -> dict[str, Any]:
     row: dict[str, Any] = {"verdict": finding.verdict, "cause": causes}
     row["confidence"] = finding.causes[0].confidence if finding.causes else None
     for e in finding.errors or (None,):
-        output, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
+        prefix, unit = (f"{e.output} ", e.unit) if e and e.output != "displacement" else ("", "m")
         for name in ("base", "extended", "noise"):
-            row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
+            row[f"{prefix}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = finding.rms_m, finding.rms_percent
     row["missed [times the noise]"] = finding.missed
     for name, p in finding.parameters.items():

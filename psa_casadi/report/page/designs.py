@@ -21,18 +21,12 @@ from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
-from psa_casadi.report.words.phrases import (
-    in_brackets,
-    length_scale,
-    number,
-    plain,
-    prefixed_scale,
-)
+from psa_casadi.report.words.phrases import any_scale, in_brackets, number, plain
 from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
 _HEIGHT, _MOST_POINTS = 360, 4000
-#: Time shown of a move and its hold at first, over the move's; the rest is behind the zoom.
+#: Duration of a move and its hold in the plot, over the move's; the zoom shows the rest.
 _SHOWN = 2.5
 _FREE = Mounting(0.0, 0.0, 0.0)
 #: Samples of the step that the page's model runs on.
@@ -54,7 +48,7 @@ def write_design_page(
     The first sentence of `summary` is the result, the others follow as a list; then come the
     figures and the tables with their notes. `badges` are short marks under the title, such as
     "2,000 samples". `live` is a model that runs in the page on the designed voltage; where no
-    script runs, a picture of it is seen, beside its path if it has one.
+    script runs, a picture shows it, with its path if it has one.
 
     Raises InputError when `path` cannot be written to.
     """
@@ -155,9 +149,7 @@ def _curve(
 
 
 def write_experiment_page(
-    path: str | os.PathLike[str],
-    design: Separated | Informative,
-    live: LiveModel | None = None,
+    path: str | os.PathLike[str], design: Separated | Informative, live: LiveModel | None = None
 ) -> None:
     """Write the page of a designed experiment, with what each of its rivals predicts.
 
@@ -173,8 +165,8 @@ def write_experiment_page(
     predicted = {r.name: r.predict(record, r.truth) for r in design.rivals}
     units = {o.name: o.unit for r in design.rivals for o in r.model.structure.outputs}
     for k, name in enumerate(design.rivals[0].outputs):
-        table = {n: y[:, k] for n, y in predicted.items()}
-        figures.append(_responses(record, table, name, units[name]))
+        outputs = {n: y[:, k] for n, y in predicted.items()}
+        figures.append(_responses(record, outputs, name, units[name]))
     write_design_page(
         path,
         title="Experiment that separates effects" if several else "Experiment for the parameters",
@@ -192,12 +184,12 @@ def _responses(
     """Return the plot of a predicted output, less the rivals' mean where there are several."""
     several = len(responses) > 1
     middle = np.mean(list(responses.values()), axis=0) if several else np.zeros(record.n)
-    table = {n: y - middle for n, y in responses.items()}
-    largest = max(float(np.max(np.abs(y))) for y in table.values())
-    scale = length_scale(largest) if unit == "m" else prefixed_scale(largest, unit)
+    deviations = {n: y - middle for n, y in responses.items()}
+    largest = max(float(np.max(np.abs(y))) for y in deviations.values())
+    scale = any_scale(largest, unit)
     name = output.removeprefix("measured_")
     plot = Panel("time [s]", in_brackets(name, scale.unit), 340)
-    for (rival, y), colour in zip(table.items(), _COLOURS * len(table), strict=False):
+    for (rival, y), colour in zip(deviations.items(), _COLOURS * len(deviations), strict=False):
         plot.line(record.time, scale.factor * y, plain(rival), colour)
     caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
     note = (
@@ -266,10 +258,10 @@ def _root_locus(d: MechanismDesign) -> Panel:
         (lag, "lag, cannot be moved", colours.INK, "square"),
     ):
         plot.marks(1e-3 * poles.real, 1e-3 * poles.imag, name, colour, 10, symbol)
-    displayed = np.concatenate([d.free_poles, d.poles, lag])
-    displayed = displayed[np.abs(displayed) < 4.0 * np.abs(d.free_poles).max()]
-    reach = 1.15e-3 * max(float(np.abs(displayed.real).max()), float(np.abs(displayed.imag).max()))
-    left = max(1.3e-3 * float(np.abs(displayed.real).max()), 0.3 * reach)
+    near = np.concatenate([d.free_poles, d.poles, lag])
+    near = near[np.abs(near) < 4.0 * np.abs(d.free_poles).max()]
+    reach = 1.15e-3 * max(float(np.abs(near.real).max()), float(np.abs(near.imag).max()))
+    left = max(1.3e-3 * float(np.abs(near.real).max()), 0.3 * reach)
     ratio, edge = min(d.reached.damping, 1.0), np.array([0.0, reach])
     for sign, name in ((-1.0, ""), (1.0, f"damping ratio {number(ratio, 3)}")):
         height = sign * np.sqrt(1.0 - ratio**2) * edge

@@ -1,4 +1,4 @@
-"""Pages of several devices: a few side by side, or a population and who stands out of it."""
+"""Pages of several devices: a few side by side, or a population with its outliers."""
 
 import os
 from collections import Counter
@@ -25,7 +25,7 @@ from psa_casadi.shown import frame
 MOST = 20
 #: Columns of a comparison as text.
 _WIDTH = 100
-#: Tiles at the top for so many devices; the table has all.
+#: Devices with a tile at the top; the table has all.
 _MOST_TILES = 4
 #: Parameters that have a plot; those in which devices stand out come first.
 _MOST_PLOTS = 12
@@ -33,13 +33,13 @@ _MOST_PLOTS = 12
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Devices side by side: what was found of each, and the parameters that several tell."""
+    """Devices side by side: the results of each, and the parameters that several determine."""
 
     findings: tuple[Finding, ...]
 
     @cached_property
     def differences(self) -> tuple[Difference, ...]:
-        """Every parameter that two devices or more tell, with p of "all have one value"."""
+        """Every parameter that two devices or more determine, with p of "all have one value"."""
         return differences(self.findings)
 
     @property
@@ -50,10 +50,10 @@ class Comparison:
     @property
     def tables(self) -> tuple[Table, ...]:
         """Verdicts with held-out errors of every output, and the parameters, if any are shared."""
-        items = [words.verdict_table(self.findings, words.error_scale(self.findings))]
+        tables = [words.verdict_table(self.findings, words.error_scale(self.findings))]
         if self.differences:
-            items.append(words.difference_table(self.findings, self.differences))
-        return tuple(t for t in items if len(t.head) > 1)  # of models alone only names
+            tables.append(words.difference_table(self.findings, self.differences))
+        return tuple(t for t in tables if len(t.head) > 1)  # of models alone only names
 
     def __repr__(self) -> str:
         """Return the sentence and the tables."""
@@ -80,10 +80,10 @@ class Comparison:
 def compare(
     *results: str | os.PathLike[str] | Result, effects: Sequence[Component] = ()
 ) -> Comparison:
-    """Compare two devices or more, stacks or of a model of one's own.
+    """Compare two devices or more, stacks or of any other model.
 
     `results` are what `identify`, `diagnose` and `load_diagnosis` return, or files of these
-    (`read_findings`); `effects` are own ones that MODEL.json names.
+    (`read_findings`); `effects` are a user's that MODEL.json names.
 
     Raises InputError for fewer than two, and for what cannot be read.
     """
@@ -126,10 +126,7 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             verdicts=words.verdict_table(findings, scale),
             warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
             budget=any(f.budget for f in findings)
-            and {
-                "panel": plots.budget_plot(findings),
-                "table": words.budget_table(findings),
-            },
+            and {"panel": plots.budget_plot(findings), "table": words.budget_table(findings)},
             parameters=rows
             and {
                 "panel": plots.difference_plot(findings, rows),
@@ -167,7 +164,7 @@ def write_population(
     badges = [f"{len(p.findings)} devices"]
     badges += [f"{len(batches)} batch{'es' if len(batches) > 1 else ''}"] if batches else []
     counts = Counter(o.parameter for o in p.outliers)
-    displayed = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
+    spreads = sorted(p.spreads, key=lambda s: -counts[s.estimates.name])[:_MOST_PLOTS]
     page = render(
         "population.html",
         "Population of devices",
@@ -179,8 +176,7 @@ def write_population(
         **words.population_tables(p),
         left_out=words.left_out_sentence(p),
         spread_pictures=[
-            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning)
-            for s in displayed
+            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in spreads
         ],
         drift_pictures=[
             Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))

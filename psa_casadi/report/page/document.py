@@ -53,17 +53,17 @@ class Picture:
 
 
 def render(template: str, title: str, badges: Sequence[str] = (), **options: Any) -> str:
-    """Return a page; no script runs in it but its own, and it asks for nothing outside."""
+    """Return a page that runs only its scripts and requests nothing from outside."""
     return filled(template, page=_Page(), title=title, badges=badges, made=_made(), **options)
 
 
-def filled(template: str, **given: Any) -> str:
+def filled(template: str, **values: Any) -> str:
     """Return the text of a template that is filled in."""
-    return environment().get_template(template).render(given)
+    return environment().get_template(template).render(values)
 
 
 class _Page:
-    """What the templates put into a page beside text: plots, the model that runs, scripts.
+    """What the templates put into a page besides text: plots, the model that runs, scripts.
 
     Plots over the same time share it: an array is in the page once.
     """
@@ -96,12 +96,12 @@ class _Page:
 
     def scripts(self) -> list[Markup]:
         """Return the scripts that the page runs."""
-        result = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
-        result += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
-        return [Markup(text) for text in result]
+        texts = [source("packed.js"), source("page.js")] if self._plots or self._alive else []
+        texts += ["\n".join(map(source, LIVE_SCRIPTS[self._alive]))] if self._alive else []
+        return [Markup(text) for text in texts]
 
     def policy(self) -> Markup:
-        """Return what a browser is told to refuse: all scripts but the page's, and all requests."""
+        """Return the policy: a browser refuses all requests, and all scripts but the page's."""
         allowed = [script_hash(text) for text in self.scripts()]
         allowed += [_library()[1]] if self._plots or self._alive else []
         rules = (
@@ -166,7 +166,7 @@ def _still_picture(figure: Figure) -> str:
 
 
 def source(name: str) -> str:
-    """Return a style or script that lies beside this file."""
+    """Return a style or script of this package."""
     return files(_HOME).joinpath(name).read_text(encoding="utf-8")
 
 

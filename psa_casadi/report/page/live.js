@@ -1,18 +1,18 @@
 // A page's model, alive: measured against model, loop and residual, drawn again while one drags.
-psaLive.report = function (box, told, run) {
+psaLive.report = function (box, data, run) {
   'use strict';
-  var make = psaLive.make, values = told.parameters.map(function (p) { return p.value; });
+  var make = psaLive.make, values = data.parameters.map(function (p) { return p.value; });
   var fitted = values.slice(), record = null, waiting = false, corrected = {checked: false}, last = null, idle = 0;
   var index = {};
-  told.parameters.forEach(function (p, i) { index[p.name] = i; });
+  data.parameters.forEach(function (p, i) { index[p.name] = i; });
 
-  told.records.forEach(function (r) {
+  data.records.forEach(function (r) {
     r.t = r.t ? psaLive.doubles(r.t) : Float64Array.from({length: r.n}, function (_, k) { return k * r.step; });
     r.measured = psaLive.singles(r.measured);
     r.correction = r.correction ? psaLive.singles(r.correction) : null;
     Object.keys(r.inputs).forEach(function (n) { r.inputs[n] = psaLive.doubles(r.inputs[n]); });
     r.over = r.inputs[r.along] || null;
-    r.time = r.t.map(function (t) { return told.time.factor * t; });
+    r.time = r.t.map(function (t) { return data.time.factor * t; });
     r.shown = r.measured.map(function (y) { return r.length.factor * y; });
     r.judged = judged(r);
   });
@@ -45,7 +45,7 @@ psaLive.report = function (box, told, run) {
       values: at, t: r.t, inputs: r.inputs, deviation: r.deviation, start: r.start, hold: r.hold, settle: true, rest: r.rest, quick: quick
     });
     if (found.status) { return found; }
-    var y = found.outputs[r.output || told.shown];
+    var y = found.outputs[r.output || data.shown];
     for (var k = 0; k < y.length; k += 1) { y[k] += corrects && r.correction ? r.correction[k] : 0; }
     return {status: 0, way: found.way, y: y};
   }
@@ -67,7 +67,7 @@ psaLive.report = function (box, told, run) {
   var plots = [0, 1, 2].map(function () { return make('div', {className: 'plot', role: 'img'}); });
   var figures = plots.map(function (plot) { return make('figure', {}, [make('figcaption', {}), plot]); });
   var legend = make('div', {className: 'legend'});
-  told.legend.forEach(function (row) {
+  data.legend.forEach(function (row) {
     var span = make('span', {text: row[1]});
     span.style.setProperty('--own', 'var(' + row[0] + ')');
     legend.appendChild(span);
@@ -80,21 +80,21 @@ psaLive.report = function (box, told, run) {
     if (now.status) { output.textContent = 'With these values the model cannot be run: ' + now.reason + '.'; return; }
     var which = record.judged.any ? 1 : null, size = rms(record, now.residual, which);
     var was = rms(record, missed(record, record.fitted), which);
-    if (told.design) {
-      output.textContent = 'Off the ' + told.aim + ' by ' + length(size) + ' rms, ' +
+    if (data.design) {
+      output.textContent = 'Off the ' + data.aim + ' by ' + length(size) + ' rms, ' +
         +(100 * size / record.range).toPrecision(2) + ' % of its range. As it was: ' + length(was) + '.';
       return;
     }
     var text = (record.judged.any ? 'Error on held-out samples' : 'Error') + ': ' + length(size) + ' rms, ' +
       +(100 * size / record.range).toPrecision(2) + ' % of the range. As fitted: ' + length(was) + '; noise, the floor: ' + length(record.floor) + '.';
-    var off = told.effects.filter(function (e) { return values[index[e.gain]] === 0 && fitted[index[e.gain]] !== 0; });
+    var off = data.effects.filter(function (e) { return values[index[e.gain]] === 0 && fitted[index[e.gain]] !== 0; });
     if (off.length) {
       text += ' With ' + off.map(function (e) { return e.title; }).join(' and ') +
         ' off nothing is fitted again: all other values were found together with ' + (off.length > 1 ? 'them' : 'it') + '.';
     }
-    if (off.length && off.length === told.effects.length) {
+    if (off.length && off.length === data.effects.length) {
       text += ' The base model, fitted without any effect, leaves ' + length(record.base) + '.';
-    } else if (record.base > record.floor && told.extended) {
+    } else if (record.base > record.floor && data.extended) {
       var left = Math.max(0, size * size - record.floor * record.floor) / (record.base * record.base - record.floor * record.floor);
       text += left < 1
         ? ' Of the base model\u2019s error above the noise (in power) ' + Math.round(100 * (1 - left)) + ' % is removed.'
@@ -112,7 +112,7 @@ psaLive.report = function (box, told, run) {
     var part = psaLive.stretch(r.time, zoom.reach), time = part(r.time), measured = {colour: '--measured', width: 3};
     function curve(y, look) { return Object.assign({x: time, y: part(y)}, look); }
     psaLive.plot(plots[0], {
-      x: 'time [' + told.time.unit + ']', y: r.labels[0], bands: held, reach: zoom.reach, zooms: true,
+      x: 'time [' + data.time.unit + ']', y: r.labels[0], bands: held, reach: zoom.reach, zooms: true,
       curves: [curve(r.shown, measured)].concat(moved ? [curve(was, {colour: '--fitted', width: 1})] : [])
         .concat([curve(model, {colour: '--model'})])
     });
@@ -124,7 +124,7 @@ psaLive.report = function (box, told, run) {
     }
     var ends = [time[0], time[time.length - 1]];
     psaLive.plot(plots[2], {
-      x: 'time [' + told.time.unit + ']', y: r.labels[2], bands: held, reach: zoom.reach, zooms: true,
+      x: 'time [' + data.time.unit + ']', y: r.labels[2], bands: held, reach: zoom.reach, zooms: true,
       curves: [curve(now.residual.map(function (e) { return g * e; }), {colour: '--model', width: 1})]
         .concat((r.noise > 0 ? [2, -2] : []).map(function (k) {
           return {x: ends, y: [k * g * r.noise, k * g * r.noise], colour: '--measured', dash: 'dash', width: 1};
@@ -135,7 +135,7 @@ psaLive.report = function (box, told, run) {
 
   // What each effect that is on takes off the error now, by itself; when the slider rests.
   function tell() {
-    var on = told.effects.filter(function (e) { return values[index[e.gain]] !== 0; }), which = record.judged.any ? 1 : null;
+    var on = data.effects.filter(function (e) { return values[index[e.gain]] !== 0; }), which = record.judged.any ? 1 : null;
     function size_(found) { return found.status ? NaN : rms(record, found.residual, which); }
     function without(i) {
       var at = values.slice();
@@ -155,7 +155,7 @@ psaLive.report = function (box, told, run) {
     draw(now);
     last = {run: ran - began, draw: performance.now() - ran, samples: record.t.length};
     clearTimeout(idle);
-    if (!told.design && !now.status) { idle = setTimeout(tell, 300); }
+    if (!data.design && !now.status) { idle = setTimeout(tell, 300); }
   }
   function later() {
     if (waiting) { return; }
@@ -169,20 +169,20 @@ psaLive.report = function (box, told, run) {
   }, later);
 
   // --- what is moved
-  var knobs = psaLive.knobs(told, values, later), switches = [];
-  if (told.records.some(function (r) { return r.correction; })) {
+  var knobs = psaLive.knobs(data, values, later), switches = [];
+  if (data.records.some(function (r) { return r.correction; })) {
     corrected = make('input', {type: 'checkbox'});
     corrected.addEventListener('change', later);
     switches.push(make('label', {className: 'switch'}, [
-      corrected, document.createTextNode('unnamed correction'), make('small', {text: told.correction})
+      corrected, document.createTextNode('unnamed correction'), make('small', {text: data.correction})
     ]));
   }
-  var chosen = make('select', {}, told.records.map(function (r, k) {
+  var chosen = make('select', {}, data.records.map(function (r, k) {
     return make('option', {value: String(k), text: r.name});
   }));
   function choose() {
     var now = values.slice(), corrects = corrected.checked;
-    record = told.records[Number(chosen.value)];
+    record = data.records[Number(chosen.value)];
     note.textContent = record.note;
     figures.forEach(function (node, k) {
       node.firstChild.textContent = record.captions[k];
@@ -209,7 +209,7 @@ psaLive.report = function (box, told, run) {
   }
   function named() {
     var found = {};
-    told.parameters.forEach(function (p, i) { found[p.name] = values[i]; });
+    data.parameters.forEach(function (p, i) { found[p.name] = values[i]; });
     return JSON.stringify(found);
   }
   var buttons = [
@@ -218,12 +218,12 @@ psaLive.report = function (box, told, run) {
       psaLive.copy(named(), function (done) { status.textContent = done ? 'Copied, in SI units.' : 'The browser refused.'; });
     })
   ];
-  if (told.file) {
+  if (data.file) {
     buttons.push(button('Download MODEL.json', function () {
-      psaLive.save('MODEL.json', psaLive.file(told, values), 'application/json');
+      psaLive.save('MODEL.json', psaLive.file(data, values), 'application/json');
     }));
   }
-  var choice = told.records.length > 1
+  var choice = data.records.length > 1
     ? [make('label', {className: 'field', text: 'Record'}, [chosen])] : [];
   [
     make('div', {className: 'bar'}, choice.concat(buttons, [status])), legend,
@@ -242,6 +242,6 @@ psaLive.report = function (box, told, run) {
       knobs.move(at);
       waiting = true;
       redraw();
-    }, answer: function (quick) { return answer(record, quick); }, file: function () { return psaLive.file(told, values); }
+    }, answer: function (quick) { return answer(record, quick); }, file: function () { return psaLive.file(data, values); }
   };
 };

@@ -3,7 +3,8 @@
 import base64
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,18 +22,10 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.records.signals import Hold, Signals
-from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.fit_words import determined
-from psa_casadi.report.words.phrases import (
-    added,
-    handy_scale,
-    in_brackets,
-    length_scale,
-    plain,
-    shown_in,
-)
+from psa_casadi.report.words.phrases import added, handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 from psa_casadi.simulation.exact.run import ALIKE
@@ -48,11 +41,11 @@ _SAMPLES, _RECORDS = 12_000, 6
 _BENT = 5e-3
 #: A parameter that spans decades is moved by this factor to both sides.
 _DECADES = 10.0
-#: A slider reaches so many half widths of the 95 % interval to both sides, at least.
+#: Reach of a slider to both sides, at least, in half widths of the 95 % interval.
 _HALF_WIDTHS = 2.0
-#: And from 0 so many ordinary changes.
+#: Reach of a slider from a value of 0, in ordinary changes.
 _TYPICAL = 4.0
-#: What stands for an infinite bound: JSON has none.
+#: The number for an infinite bound: JSON has none.
 _NO_BOUND = 1e300
 
 
@@ -62,9 +55,9 @@ class LiveRecord:
 
     `inputs` are arrays (n,) in SI units by name, between samples as `hold` says; a loop is drawn
     over the one `along`. `deviation` holds the start of states off where a stack's voltage puts
-    them, any other model begins at the states `start` (nx,). A sensor with an `offset` has it found
-    again. `floor` is the noise that errors are judged by, `correction` what an unnamed correction
-    adds. It begins in motion, or at `rest`.
+    them, any other model starts at the states `start` (nx,). A sensor with an `offset` has it
+    estimated again. `floor` is the noise that errors are judged by, `correction` what an unnamed
+    correction adds. It starts in motion, or at `rest`.
     """
 
     series: Series
@@ -81,13 +74,13 @@ class LiveRecord:
 
     @property
     def residual(self) -> FloatArray:
-        """What the model leaves as it was fitted."""
+        """The residual of the fitted model."""
         return self.series.residual(self.series.curves[-1])
 
 
 @dataclass(frozen=True, eq=False)
 class LiveModel:
-    """A model that a page is to hold, with the compilation of its module that has begun.
+    """A model for a page, with its module, which is being compiled.
 
     `aim` is what it is compared with; a `design` has neither noise nor a sensor with an offset.
     """
@@ -100,50 +93,39 @@ class LiveModel:
     extended: bool = False
     correction: str = ""
 
-    def told(self) -> dict[str, Any] | None:
-        """Return what live.js must know, once the module is there; None where there is none."""
+    def page_data(self) -> dict[str, Any] | None:
+        """Return the data for live.js, once the module is compiled; None without a module."""
         module = self.module.result()
         if module is None:
             return None
-        displayed = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
-        first, counts = displayed[0].series, any(r.series.counts for r in self.records)
-        largest = max(float(np.nanmax(np.abs(r.residual))) for r in displayed)
+        records = sorted(self.records, key=lambda r: r.series.miss(-1), reverse=True)[:_RECORDS]
+        first, counts = records[0].series, any(r.series.counts for r in self.records)
+        largest = max(float(np.nanmax(np.abs(r.residual))) for r in records)
         length = handy_scale(first.span, counts=counts)
         error = length_scale(largest or 1e-2 * first.span, counts=counts)
-        limit, rows = _SAMPLES // len(displayed), []
-        for r in displayed:
+        limit, rows = _SAMPLES // len(records), []
+        for r in records:
             s = r.series  # of a stack all records have the same units
-            scales = {"length": length, "error": error}
-            if s.unit:
-                scales = {"length": s.scale, "error": s.residual_scale}
-            words = {
-                "captions": [
-                    f"{s.title} over time",
-                    f"{s.title} over {r.along}" if r.along else "",
-                    f"{self.aim} minus model".capitalize(),
-                ],
-                "labels": [
-                    in_brackets(s.quantity, scales["length"].unit),
-                    s.against,
-                    in_brackets("difference", scales["error"].unit),
-                ],
-            }
-            table = {n: {"unit": q.unit, "factor": q.factor} for n, q in scales.items()}
-            rows.append({**_record(r, limit, self.design), **table, **words})
+            units = (s.scale, s.residual_scale) if s.unit else (length, error)
+            over = f"{s.title} over {r.along}" if r.along else ""
+            labels = map(in_brackets, (s.quantity, "difference"), (q.unit for q in units))
+            row = _record(r, limit, self.design)
+            row |= {n: asdict(q) for n, q in zip(("length", "error"), units, strict=True)}
+            difference = f"{self.aim} minus model".capitalize()
+            row["captions"] = [f"{s.title} over time", over, difference]
+            row["labels"] = [next(labels), s.against, next(labels)]
+            rows.append(row)
         return {
             "kind": "report",
             **live_data(self.model, module),
             "records": rows,
-            "time": {"unit": first.time_scale.unit, "factor": first.time_scale.factor},
-            "extended": self.extended,
-            "design": self.design,
-            "aim": self.aim,
-            "correction": self.correction,
+            "time": asdict(first.time_scale),
+            **{n: getattr(self, n) for n in ("extended", "design", "aim", "correction")},
             "legend": [["--measured", self.aim], ["--model", "model"], ["--fitted", "as it was"]],
         }
 
     def cure(self) -> str:
-        """Return why the model does not run in the page, and what would make it."""
+        """Return why the model does not run in the page, and the remedy."""
         if self.model.structure.foreign:
             return "It is an imported FMU, of which a page has no equations."
         if self.model.sampled_names:
@@ -152,7 +134,7 @@ class LiveModel:
 
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of a diagnosis alive; `rows` are its series."""
+    """Start to compile the model of a diagnosis for its page; `rows` are its series."""
     module, beyond, share, text = begun_module(d.model), list[FloatArray](), 1.0, ""
     if isinstance(d, StackDiagnosis):
         # the page's other errors are judged by the noise of all records together
@@ -160,15 +142,13 @@ def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> Liv
         if d.patch is not None:
             beyond = [p - x for p, x in zip(d.patch.predicted, d.extended, strict=True)]
             text = f"{d.patch.name}, as it was found: it does not follow"
-    records = _fitted_records(d.model, d.extended_fit, d.experiments, rows, beyond, share)
+    records = _fitted_records(d, d.extended_fit, rows, beyond, share)
     return LiveModel(d.model, module, records, extended=added(d), correction=text)
 
 
 def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveModel:
-    """Begin what makes the model of an identification alive; `rows` are its series."""
-    records = _fitted_records(
-        identification.model, identification.fit, identification.experiments, rows
-    )
+    """Start to compile the model of an identification for its page; `rows` are its series."""
+    records = _fitted_records(identification, identification.fit, rows)
     return LiveModel(identification.model, begun_module(identification.model), records)
 
 
@@ -179,46 +159,41 @@ def live_design(
     *,
     rest: bool = False,
 ) -> LiveModel:
-    """Begin what lets a model run on a designed voltage.
+    """Start to compile a model that runs on a designed voltage.
 
     `record` is time [s], voltage [V] and the model's displacement [m]; `wanted` the path that it is
-    to follow, where there is one. The model begins in motion, or at `rest`.
+    to follow, where there is one. The model starts in motion, or at `rest`.
     """
-    time, voltage, displayed = record
-    aim, words = (displayed, "design") if wanted is None else (wanted, "path")
-    curve, none = Curve("model", colours.EXTENDED, displayed), np.zeros(len(time), dtype=bool)
+    time, voltage, displacement = record
+    aim, words = (displacement, "design") if wanted is None else (wanted, "path")
+    curve, none = Curve("model", colours.EXTENDED, displacement), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
     return LiveModel(model, begun_module(model), [row], aim=words, design=True)
 
 
 def live_experiment(model: Model, record: Signals) -> LiveModel:
-    """Begin what lets any model but a stack run on a designed record, from its declared starts."""
+    """Start to compile any model but a stack that runs on a designed record."""
     s, time = model.structure, record.time - record.time[0]
     start = np.array([q.start for q in s.states])
     u = input_samples(model, record.n, record.columns)
-    displayed = run(model, time, u, start, hold=record.hold).y.T
+    outputs = run(model, time, u, start, hold=record.hold).y.T
     along, none = next(iter(record.columns)), np.zeros(record.n, dtype=bool)
+    live_record = partial(LiveRecord, along=along, start=start, hold=record.hold)
     rows = []
-    for output, y in zip(s.outputs, displayed, strict=True):
+    for output, y in zip(s.outputs, outputs, strict=True):
         series = Series(
             output.name, time, record.columns[along], y, (Curve("model", colours.EXTENDED, y),),
             none, noise=0.0, counts=False, quantity=output.name, unit=output.unit,
             against=in_brackets(along, record.units[along]),
         )  # fmt: skip
-        rows.append(
-            LiveRecord(
-                series, record.columns, output=output.name, along=along, start=start,
-                hold=record.hold,
-            )
-        )  # fmt: skip
+        rows.append(live_record(series, record.columns, output=output.name))
     return LiveModel(model, begun_module(model), rows, aim="design", design=True)
 
 
 def _fitted_records(
-    model: Model,
+    result: Diagnosis | Identification,
     fit: Fit,
-    experiments: Sequence[Experiment],
     series: Sequence[Series],
     beyond: Sequence[FloatArray] = (),
     share: float = 1.0,
@@ -227,8 +202,8 @@ def _fitted_records(
 
     `share` is what counts of each record's noise where errors are judged.
     """
+    model, experiments, rows = result.model, result.experiments, []
     theta, stack = fit.placed(experiments), is_stack(model)
-    rows = []
     for s in series:
         k, j = s.place
         e, channel = experiments[k], experiments[k].channels[j]
@@ -247,7 +222,7 @@ def _fitted_records(
 
 
 def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
-    """Return a record as a page holds it, in SI units, its time from its own first sample on."""
+    """Return a record as a page holds it, in SI units, its time from its first sample on."""
     s = r.series
     part, note = thinned(s.time, [*r.inputs.values()], limit)
     t = s.time[part] - s.time[0]
@@ -280,10 +255,10 @@ def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
 
 
 def thinned(t: FloatArray, inputs: Sequence[FloatArray], limit: int) -> tuple[IndexArray, str]:
-    """Return at most `limit` samples of a record and what must be said of them.
+    """Return at most `limit` samples of a record, and a note on their choice.
 
-    Every so-manieth one if the inputs are straight between them, else those of the beginning: a
-    model's answer to a voltage with its corners cut is that to another voltage.
+    They are evenly spaced if the inputs are straight between them, else the first ones: the
+    response to a voltage with its corners cut is that to another voltage.
     """
     n = len(t)
     if n <= limit:
@@ -317,7 +292,7 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         file = dumps(model)
     except InputError:  # no file holds such a model
         file = None
-    displayed, s, known = output_of(model), model.structure, determined(model)
+    main, s, known = output_of(model), model.structure, determined(model)
     nominals = dict(zip(model.output_names, model.output_nominals(), strict=True))
     return {
         "name": model.name,
@@ -329,32 +304,31 @@ def live_data(model: Model, module: bytes) -> dict[str, Any]:
         "states": [{**_variable(q), "start": q.start} for q in s.states],
         "nominals": model.state_nominals().tolist(),
         "error_sizes": model.error_sizes().tolist(),
-        "shown": displayed,
-        "shown_nominal": 0.0 if displayed is None else float(nominals[displayed]),
+        "shown": main,
+        "shown_nominal": 0.0 if main is None else float(nominals[main]),
         "starts_itself": model.starts_itself,
         "file": file,
     }
 
 
 def _variable(v: State | Output) -> dict[str, Any]:
-    scale = _scale(v.unit, v.display_unit or v.unit)
-    return {"name": v.name, "description": v.description, "si": v.unit, **scale}
+    return {"name": v.name, "description": v.description, "si": v.unit, **_scale(v)}
 
 
-def _scale(unit: str, display: str) -> dict[str, Any]:
-    shift = convert(0.0, unit, display)
-    return {"unit": display, "factor": convert(1.0, unit, display) - shift, "shift": shift}
+def _scale(v: State | Output | Parameter) -> dict[str, Any]:
+    unit = v.display_unit or v.unit
+    shift = convert(0.0, v.unit, unit)
+    return {"unit": unit, "factor": convert(1.0, v.unit, unit) - shift, "shift": shift}
 
 
 def _parameter(model: Model, p: Parameter, known: bool) -> dict[str, Any]:
-    unit, display = shown_in(model, p.name)
     interval = model.provenance.intervals.get(p.name)
     sure = [interval.low, interval.high] if interval is not None else []
     ends = _ends(model, p)
     return {
         "name": p.name,
         "description": p.description,
-        **_scale(unit, display),
+        **_scale(p),
         "value": model.values[p.name],
         "bounds": np.clip(p.bounds, -_NO_BOUND, _NO_BOUND).tolist(),
         "ends": list(ends),

@@ -1,9 +1,9 @@
 // A model's FMU (FMI 3.0) out of a page: its C sources with the values chosen here as start values. No binaries.
-psaLive.fmu = function (told, values, stack) {
+psaLive.fmu = function (data, values, stack) {
   'use strict';
-  var parts = told.fmu, name = stack.name.replace(/\W/g, '_').replace(/^(?=\d)/, '_');
+  var parts = data.fmu, name = stack.name.replace(/\W/g, '_').replace(/^(?=\d)/, '_');
   var starts = Object.create(null), sizes = Object.assign(Object.create(null), stack.fmu.sizes);
-  told.parameters.forEach(function (p, i) {
+  data.parameters.forEach(function (p, i) {
     starts[p.name] = number(values[i]);
     if (values[i] !== 0) { sizes[p.name] = Math.abs(values[i]); }
   });
@@ -31,7 +31,7 @@ psaLive.fmu = function (told, values, stack) {
       });
     },
     'sources/fmi_data.c': function (text) {
-      var states = told.states.map(function (s) { return stack.fmu.sizes[s.name] || 1; });
+      var states = data.states.map(function (s) { return stack.fmu.sizes[s.name] || 1; });
       text = vector(text, 'psa_start_parameters', values);
       return vector(vector(text, 'psa_state_nominals', states), 'psa_switch_scales', stack.fmu.scales);
     }

@@ -12,11 +12,11 @@ psaLive.make = function (tag, options, children) {
 };
 
 // Calls `changed` after every move. `values` are the model's, in SI units, in its own order.
-psaLive.knobs = function (told, values, changed) {
+psaLive.knobs = function (data, values, changed) {
   'use strict';
   var make = psaLive.make, STEPS = 1000, count = 0, rows = {}, switches = [];
   var index = {}, started = values.slice();
-  told.parameters.forEach(function (p, i) { index[p.name] = i; });
+  data.parameters.forEach(function (p, i) { index[p.name] = i; });
 
   function share(p, value) {
     var a = p.ends[0], b = p.ends[1];
@@ -34,7 +34,7 @@ psaLive.knobs = function (told, values, changed) {
   }
 
   function put(name, value, from) {
-    var i = index[name], p = told.parameters[i], row = rows[name];
+    var i = index[name], p = data.parameters[i], row = rows[name];
     values[i] = Math.min(p.bounds[1], Math.max(p.bounds[0], value));
     if (row) {
       if (from !== row.range) { row.range.value = String(Math.round(STEPS * share(p, values[i]))); }
@@ -46,7 +46,7 @@ psaLive.knobs = function (told, values, changed) {
   }
 
   function knob(p) {
-    var id = 'psa-' + told.number + '-' + (count += 1);
+    var id = 'psa-' + data.number + '-' + (count += 1);
     var range = make('input', {type: 'range', min: '0', max: String(STEPS), step: '1', id: id});
     var number = make('input', {type: 'number', step: 'any', 'aria-label': p.name + ' in ' + p.unit});
     var way = make('div', {className: 'way'}, [range]);
@@ -99,10 +99,10 @@ psaLive.knobs = function (told, values, changed) {
   return {
     // Switches, then the sliders that `first` chooses, then all others behind a fold.
     nodes: function (first, more, open) {
-      var near = told.parameters.filter(first), far = told.parameters.filter(function (p) { return !first(p); });
+      var near = data.parameters.filter(first), far = data.parameters.filter(function (p) { return !first(p); });
       var fold = far.length ? make('fieldset', {'aria-label': 'other parameters'}, far.map(knob)) : null;
       return [
-        group('Effects', told.effects.map(effect).concat(more || [])),
+        group('Effects', data.effects.map(effect).concat(more || [])),
         group('Parameters', near.map(knob)),
         fold && make('details', {open: Boolean(open) || !near.length}, [make('summary', {text: 'All other parameters (' + far.length + ')'}), fold])
       ].filter(Boolean);
@@ -110,10 +110,10 @@ psaLive.knobs = function (told, values, changed) {
     // Move all sliders; to values that count as not moved, if `settled`.
     move: function (given, settled) {
       if (settled) { started = given.slice(); }
-      told.parameters.forEach(function (p, i) { put(p.name, given[i]); });
+      data.parameters.forEach(function (p, i) { put(p.name, given[i]); });
     },
     row: function (name) { return rows[name].knob; },
-    moved: function () { return told.parameters.filter(function (p, i) { return values[i] !== started[i]; }); }
+    moved: function () { return data.parameters.filter(function (p, i) { return values[i] !== started[i]; }); }
   };
 };
 
@@ -134,7 +134,7 @@ psaLive.save = function (name, text, type) {
   setTimeout(function () { URL.revokeObjectURL(link.href); }, 1000);
 };
 
-psaLive.copy = function (text, told) {
+psaLive.copy = function (text, then) {
   'use strict';
   function byHand() {
     var area = psaLive.make('textarea', {value: text});
@@ -142,18 +142,18 @@ psaLive.copy = function (text, told) {
     area.select();
     var done = document.execCommand('copy');
     area.remove();
-    told(done);
+    then(done);
   }
   if (!navigator.clipboard) { byHand(); return; }
-  navigator.clipboard.writeText(text).then(function () { told(true); }, byHand);
+  navigator.clipboard.writeText(text).then(function () { then(true); }, byHand);
 };
 
 // MODEL.json with other values: what no longer holds of it (intervals, evidence) goes.
 // Where a `stack` is given, the model is called after it, and effects that are switched off are left out.
-psaLive.file = function (told, values, stack) {
+psaLive.file = function (data, values, stack) {
   'use strict';
-  var content = JSON.parse(told.file), changed = false;
-  told.parameters.forEach(function (p, i) {
+  var content = JSON.parse(data.file), changed = false;
+  data.parameters.forEach(function (p, i) {
     var entry = content.parameters[p.name];
     if (!entry || entry.value === values[i]) { return; }
     entry.value = values[i];
@@ -162,7 +162,7 @@ psaLive.file = function (told, values, stack) {
     changed = true;
   });
   if (stack) {
-    var off = told.effects.filter(function (e) { return content.parameters[e.gain].value === 0; });
+    var off = data.effects.filter(function (e) { return content.parameters[e.gain].value === 0; });
     off.forEach(function (e) { e.parameters.forEach(function (name) { delete content.parameters[name]; }); });
     content.effects = content.effects.filter(function (e) {
       return !off.some(function (o) { return o.name === (e.name || e); });

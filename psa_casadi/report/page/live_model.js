@@ -13,29 +13,29 @@ psaLive.reasons = {
   10: 'there is no equilibrium to start from', 11: 'the browser gives no more memory'
 };
 
-// Promise of a model. `told` lists inputs, outputs, states, parameters, as live_data.py writes them.
-psaLive.load = function (told) {
+// Promise of a model. `data` lists inputs, outputs, states, parameters, as live_data.py writes them.
+psaLive.load = function (data) {
   'use strict';
   function run(page, asked) {
-    var n = asked.t.length, nu = told.inputs.length;
+    var n = asked.t.length, nu = data.inputs.length;
     function view(at, count) { return new Float64Array(page.memory.buffer, at, count); }
     if (page.page_reserve(n)) { return {status: 11, reason: psaLive.reasons[11]}; }
-    view(page.page_parameters(), told.parameters.length).set(asked.values);
-    view(page.page_nominal(), told.states.length).set(asked.nominals || told.nominals);
-    view(page.page_error_size(), told.states.length).set(asked.error_sizes || told.error_sizes);
-    view(page.page_deviation(), told.states.length).set(told.states.map(function (s) {
+    view(page.page_parameters(), data.parameters.length).set(asked.values);
+    view(page.page_nominal(), data.states.length).set(asked.nominals || data.nominals);
+    view(page.page_error_size(), data.states.length).set(asked.error_sizes || data.error_sizes);
+    view(page.page_deviation(), data.states.length).set(data.states.map(function (s) {
       return (asked.deviation && asked.deviation[s.name]) || 0;
     }));
-    view(page.page_start(), told.states.length).set(asked.start || told.states.map(function (s) { return s.start; }));
+    view(page.page_start(), data.states.length).set(asked.start || data.states.map(function (s) { return s.start; }));
     view(page.page_times(), n).set(asked.t);
     var inputs = view(page.page_inputs(), n * nu);
-    told.inputs.forEach(function (input, j) {
+    data.inputs.forEach(function (input, j) {
       var given = asked.inputs[input.name];
       for (var k = 0; k < n; k += 1) { inputs[k * nu + j] = given ? given[k] : input.start; }
     });
-    var settle = !asked.start && (asked.settle || !told.starts_itself);
+    var settle = !asked.start && (asked.settle || !data.starts_itself);
     var status = page.page_run(asked.rtol || (asked.quick ? psaLive.dragged : 1e-6), asked.hold === 'zero' ? 1 : 0, settle ? (asked.rest ? 2 : 1) : 0,
-      asked.quick ? 1 : 0, told.shown_nominal);
+      asked.quick ? 1 : 0, data.shown_nominal);
     function columns(at, names) {
       var all = view(at, n * names.length), found = {};
       names.forEach(function (row, i) {
@@ -48,10 +48,10 @@ psaLive.load = function (told) {
     if (status) { return {status: status, reason: psaLive.reasons[status]}; }
     return {
       status: 0, way: page.page_way() ? 'exact steps' : 'stepper', steps: page.page_steps(),
-      outputs: columns(page.page_outputs(), told.outputs), states: columns(page.page_states(), told.states)
+      outputs: columns(page.page_outputs(), data.outputs), states: columns(page.page_states(), data.states)
     };
   }
-  return psaPacked.open(told.wasm).then(function (bytes) {
+  return psaPacked.open(data.wasm).then(function (bytes) {
     try {
       return new WebAssembly.Instance(new WebAssembly.Module(bytes), {Math: Math});
     } catch (refused) { // browsers of before 2023 compile so much only beside the page's own work

@@ -40,23 +40,23 @@ psaLive.plot = (function () {
     return Object.assign({}, c, {x: x, y: y});
   }
 
-  // told: x and y (labels), curves of {x, y, colour (a custom property), width, dash}, bands [from, to]
+  // data: x and y (labels), curves of {x, y, colour (a custom property), width, dash}, bands [from, to]
   // over x, logx, logy, zooms (a stretch of x may be chosen).
-  return function (box, told) {
+  return function (box, data) {
     var margin = {l: box.clientWidth < 360 ? 52 : 62, r: 12, t: 8, b: 42};
-    var style = getComputedStyle(box), reach = {x: told.reach || ends(told.curves, 'x', told.logx), y: ends(told.curves, 'y', told.logy)};
+    var style = getComputedStyle(box), reach = {x: data.reach || ends(data.curves, 'x', data.logx), y: ends(data.curves, 'y', data.logy)};
     function ink(name) { return style.getPropertyValue(name).trim(); }
     function axis(which) {
       return {
-        title: {text: told[which], standoff: 4}, range: reach[which], type: told['log' + which] ? 'log' : 'linear', zeroline: false,
-        showline: true, mirror: true, linecolor: ink('--quiet'), gridcolor: ink('--line'), fixedrange: which === 'y' || !told.zooms,
-        dtick: told['log' + which] ? 1 : undefined
+        title: {text: data[which], standoff: 4}, range: reach[which], type: data['log' + which] ? 'log' : 'linear', zeroline: false,
+        showline: true, mirror: true, linecolor: ink('--quiet'), gridcolor: ink('--line'), fixedrange: which === 'y' || !data.zooms,
+        dtick: data['log' + which] ? 1 : undefined
       };
     }
     box.place = {reach: reach, area: {
       left: margin.l, top: margin.t, width: box.clientWidth - margin.l - margin.r, height: box.clientHeight - margin.t - margin.b
     }};
-    Plotly.react(box, told.curves.map(function (c) {
+    Plotly.react(box, data.curves.map(function (c) {
       var shown = outline(c);
       return {
         type: 'scatter', mode: 'lines', x: shown.x, y: shown.y, hoverinfo: 'skip',
@@ -65,11 +65,11 @@ psaLive.plot = (function () {
     }), {
       template: {}, margin: margin, width: box.clientWidth, height: box.clientHeight, showlegend: false, hovermode: false,
       paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)', font: {size: 12, color: ink('--quiet'), family: 'system-ui, sans-serif'},
-      dragmode: told.zooms && !psaPage.finger ? 'zoom' : false, xaxis: axis('x'), yaxis: axis('y'),
-      shapes: (told.bands || []).map(function (b) {
+      dragmode: data.zooms && !psaPage.finger ? 'zoom' : false, xaxis: axis('x'), yaxis: axis('y'),
+      shapes: (data.bands || []).map(function (b) {
         return {type: 'rect', yref: 'paper', x0: b[0], x1: b[1], y0: 0, y1: 1, fillcolor: ink('--held'), line: {width: 0}, layer: 'below'};
       })
-    }, {displayModeBar: false, staticPlot: !told.zooms, doubleClick: 'autosize'});
+    }, {displayModeBar: false, staticPlot: !data.zooms, doubleClick: 'autosize'});
   };
 })();
 

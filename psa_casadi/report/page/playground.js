@@ -1,11 +1,11 @@
 // A stack to play with: a voltage, any of the effects, and what comes of them.
-psaLive.playground = function (box, told, run) {
+psaLive.playground = function (box, data, run) {
   'use strict';
-  var make = psaLive.make, values = told.parameters.map(function (p) { return p.value; });
+  var make = psaLive.make, values = data.parameters.map(function (p) { return p.value; });
   var how = {kind: 'triangle', low: 0, high: 1, frequency: 5, cycles: 3, samples: 2000};
-  var stack = told.stacks[0], own = null, played = null, without = {key: ''}, waiting = false, idle = 0, last = null, drawn = null;
-  var gains = told.effects.map(function (e) { return told.parameters.findIndex(function (p) { return p.name === e.gain; }); });
-  var shown = told.outputs.find(function (o) { return o.name === told.shown; });
+  var stack = data.stacks[0], own = null, played = null, without = {key: ''}, waiting = false, idle = 0, last = null, drawn = null;
+  var gains = data.effects.map(function (e) { return data.parameters.findIndex(function (p) { return p.name === e.gain; }); });
+  var shown = data.outputs.find(function (o) { return o.name === data.shown; });
   var UM = {unit: '\u00b5m', factor: 1e6};
 
   function asked(at, t, v, quick) {
@@ -55,7 +55,7 @@ psaLive.playground = function (box, told, run) {
       return;
     }
     drawn = now;
-    var y = now.outputs[told.shown], y0 = without.found.outputs[told.shown];
+    var y = now.outputs[data.shown], y0 = without.found.outputs[data.shown];
     var time = scaled(t, 1e3), um = scaled(y, UM.factor), um0 = scaled(y0, UM.factor);
     var added = y.map(function (x, k) { return 1e9 * (x - y0[k]); });
     var label = 'time [ms]', part = psaLive.stretch(time, zoom.reach), shown = part(time);
@@ -83,7 +83,7 @@ psaLive.playground = function (box, told, run) {
 
   // The answer to a step of a hundredth of the span, at the middle: its resonances and lags.
   function answer() {
-    var n = 4096, dt = 1 / (4e3 * told.band), t = new Float64Array(n), v = new Float64Array(n);
+    var n = 4096, dt = 1 / (4e3 * data.band), t = new Float64Array(n), v = new Float64Array(n);
     var middle = 0.5 * (how.low + how.high), small = 0.01 * (how.high - how.low) || 0.01;
     for (var k = 0; k < n; k += 1) { t[k] = k * dt; v[k] = k < 8 ? middle : middle + small; }
     var frequencies = Float64Array.from({length: 160}, function (_, i) {
@@ -92,14 +92,14 @@ psaLive.playground = function (box, told, run) {
     var curves = [[bare(), '--measured'], [values, '--model']].map(function (row) {
       var found = asked(row[0], t, v, true);
       if (found.status) { return null; }
-      return {x: scaled(frequencies, 1e-3), y: scaled(psaLive.voltages.response(v, found.outputs[told.shown], dt, frequencies), 1e9), colour: row[1]};
+      return {x: scaled(frequencies, 1e-3), y: scaled(psaLive.voltages.response(v, found.outputs[data.shown], dt, frequencies), 1e9), colour: row[1]};
     }).filter(Boolean);
     psaLive.plot(plots[5], {x: 'frequency [kHz]', y: 'gain [nm/V]', logx: true, logy: true, curves: curves});
   }
 
   function later() {
     gains.forEach(function (i, k) {
-      told.effects[k].parameters.forEach(function (name) { knobs.row(name).hidden = values[i] === 0; });
+      data.effects[k].parameters.forEach(function (name) { knobs.row(name).hidden = values[i] === 0; });
     });
     if (waiting) { return; }
     waiting = true;
@@ -154,8 +154,8 @@ psaLive.playground = function (box, told, run) {
   });
 
   function setStack(k, anew) {
-    stack = told.stacks[k];
-    knobs.move(told.parameters.map(function (p, i) {
+    stack = data.stacks[k];
+    knobs.move(data.parameters.map(function (p, i) {
       return p.name in stack.values ? stack.values[p.name] : anew ? p.value : values[i];
     }), true);
     how.low = 0;
@@ -200,34 +200,34 @@ psaLive.playground = function (box, told, run) {
   function csv() {
     redraw();
     if (!drawn) { return ''; }
-    var names = told.outputs.map(function (o) { return o.name; });
-    var head = ['time [s]', 'voltage [V]'].concat(told.outputs.map(function (o) { return o.name + ' [' + o.si + ']'; })).join(',');
+    var names = data.outputs.map(function (o) { return o.name; });
+    var head = ['time [s]', 'voltage [V]'].concat(data.outputs.map(function (o) { return o.name + ' [' + o.si + ']'; })).join(',');
     var rows = Array.prototype.map.call(played.t, function (t, k) {
       return [t, played.v[k]].concat(names.map(function (n) { return drawn.outputs[n][k]; })).join(',');
     });
     return [head].concat(rows).join('\n') + '\n';
   }
 
-  var knobs = psaLive.knobs(told, values, later), about = make('p', {className: 'note'});
-  var nodes = knobs.nodes(function (p) { return told.of_effects.indexOf(p.name) >= 0; }, [], false);
+  var knobs = psaLive.knobs(data, values, later), about = make('p', {className: 'note'});
+  var nodes = knobs.nodes(function (p) { return data.of_effects.indexOf(p.name) >= 0; }, [], false);
   var bars = [
     make('div', {className: 'bar'}, [
-      field('Stack', select(told.stacks.map(function (s) { return s.name; }), setStack)),
+      field('Stack', select(data.stacks.map(function (s) { return s.name; }), setStack)),
       field('Voltage', select(kinds, function (k) { how.kind = kinds[k]; own = null; play(); })),
       field('from [V]', fields.low), field('to [V]', fields.high), field('frequency [Hz]', fields.frequency),
       field('cycles', fields.cycles), field('samples', fields.samples)
     ]),
     make('div', {className: 'bar'}, [
       field('or corners (s V, s V, ...)', corners), field('or a CSV file', file),
-      button('Reset', function () { setStack(told.stacks.indexOf(stack), true); }),
+      button('Reset', function () { setStack(data.stacks.indexOf(stack), true); }),
       button('Download CSV', function () { psaLive.save('trajectory.csv', csv(), 'text/csv'); })
-    ].concat(told.fmu ? [button('Download FMU', function () {
-      psaLive.fmu(told, values, stack).then(function (bytes) {
+    ].concat(data.fmu ? [button('Download FMU', function () {
+      psaLive.fmu(data, values, stack).then(function (bytes) {
         psaLive.save(stack.name.replace(/\W/g, '_') + '.fmu', bytes, 'application/octet-stream');
         status.textContent = 'The FMU (FMI 3.0) has C sources and no binaries: compile it, or let its importer do so.';
       });
-    })] : []).concat(told.file ? [button('Download MODEL.json', function () {
-      psaLive.save('MODEL.json', psaLive.file(told, values, stack), 'application/json');
+    })] : []).concat(data.file ? [button('Download MODEL.json', function () {
+      psaLive.save('MODEL.json', psaLive.file(data, values, stack), 'application/json');
     })] : [], [status]))
   ];
   bars.concat([about, make('p', {className: 'note', text: 'Draw over the voltage to change it.'}), beyond, legend,
@@ -236,7 +236,7 @@ psaLive.playground = function (box, told, run) {
       make('div', {className: 'pair'}, figures.slice(4)), output
     ], plots[2], nodes)]).forEach(function (n) { box.appendChild(n); });
   setStack(0);
-  told.effects.forEach(function (e, k) { // page.html#slow_creep begins with that effect
+  data.effects.forEach(function (e, k) { // page.html#slow_creep begins with that effect
     if (decodeURIComponent(location.hash.slice(1)) !== e.name) { return; }
     var at = values.slice();
     at[gains[k]] = e.on;
@@ -246,9 +246,9 @@ psaLive.playground = function (box, told, run) {
   window.addEventListener('resize', later);
   window.matchMedia('(prefers-color-scheme: dark)').addEventListener('change', later);
   box.psa = {values: values, last: function () { return last; }, csv: csv, file: function () {
-    return psaLive.file(told, values, stack);
+    return psaLive.file(data, values, stack);
   }, set: function (name, value) {
-    values[told.parameters.findIndex(function (p) { return p.name === name; })] = value;
+    values[data.parameters.findIndex(function (p) { return p.name === name; })] = value;
     waiting = true;
     redraw();
   }};

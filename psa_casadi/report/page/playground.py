@@ -26,9 +26,9 @@ from psa_casadi.report.page.document import packed, render
 from psa_casadi.report.page.live import live_data
 from psa_casadi.variables import Provenance
 
-#: The stack that a page has where no model is given, and where the answer to a step ends [kHz].
+#: The stack of a page without a model, and the end of the frequency response [kHz].
 STACK, _BAND = "P-885.51", 100.0
-#: What stands in the texts for the model's name.
+#: The placeholder of the model's name in the texts.
 NAME = "psa_name_in_page"
 _README = "sources/README.txt"
 #: Kinds of variables whose usual size follows from the values of parameters.
@@ -46,23 +46,23 @@ def write_playground(path: str | os.PathLike[str], model: Model | None = None) -
 
 def playground(model: Model | None = None) -> str:
     """Return the page; see `write_playground`."""
-    inputs = stack_model(STACK) if model is None else model
-    if "voltage" not in inputs.input_names or "displacement" not in inputs.output_names:
+    stack = stack_model(STACK) if model is None else model
+    if "voltage" not in stack.input_names or "displacement" not in stack.output_names:
         raise InputError(
-            [f"The model '{inputs.name}' has no voltage input or no displacement output: no stack."]
+            [f"The model '{stack.name}' has no voltage input or no displacement output: no stack."]
         )
-    whole = inputs.with_declared_starts()
+    whole = stack.with_declared_starts()
     for effect in EFFECTS.values():
         if not {p.name for p in effect.parameters} & set(whole.parameter_names):
             whole = whole.with_effect(effect)
-    title = next((n for n in STACKS if stack_model(n).name == inputs.name), inputs.name)
-    stacks = [_stack(inputs, whole, title, inputs.description)]
+    title = next((n for n in STACKS if stack_model(n).name == stack.name), stack.name)
+    stacks = [_stack(stack, whole, title, stack.description)]
     # the terms of a model that states some are not those of other stacks
-    names = {c.name for c in inputs.components}
-    if not inputs.publication.stated and names >= {c.name for c in BASE}:
+    names = {c.name for c in stack.components}
+    if not stack.publication.stated and names >= {c.name for c in BASE}:
         others = [name for name in STACKS if name != title]
         stacks += [_stack(stack_model(n), whole, n, STACKS[n].description) for n in others]
-    table = {
+    data = {
         "kind": "playground",
         **live_data(whole, web_module(whole)),
         "stacks": stacks,
@@ -71,7 +71,7 @@ def playground(model: Model | None = None) -> str:
         "band": _BAND,
     }
     badges = ["every effect", "no network"]
-    return render("playground.html", f"Play with {title}", badges, told=table)
+    return render("playground.html", f"Play with {title}", badges, data=data)
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:
@@ -126,10 +126,10 @@ def fmu_figures(model: Model, about: Model) -> dict[str, Any]:
     It is what `about` is: usual sizes by name, the noise of the switches, the span of the
     default experiment [s], a description.
     """
-    table = variable_table(model)
-    states = [abs(v.nominal or 1.0) for v in table if v.kind == "state"]
+    variables = variable_table(model)
+    states = [abs(v.nominal or 1.0) for v in variables if v.kind == "state"]
     return {
-        "sizes": {v.name: abs(v.nominal) for v in table if v.kind in _SIZED and v.nominal},
+        "sizes": {v.name: abs(v.nominal) for v in variables if v.kind in _SIZED and v.nominal},
         "scales": switch_scales(model, states),
         "span": default_span(model),
         "description": describe(about),

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -10,15 +9,13 @@ import numpy as np
 
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
-from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
+from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import signature
 from psa_casadi.files import atomic_write
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
-from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
-from psa_casadi.records.split import Experiment
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
 from psa_casadi.report.plots import findings, records
@@ -43,32 +40,15 @@ _MOST_SAMPLES = 13_000
 MOST_RECORDS = 16
 #: Causes whose signatures are drawn, views of residuals, records and sentences that are listed.
 _SIGNATURES, _VIEWS, _TOLD_RECORDS, _TOLD = 3, 3, 4, 6
-#: Of any model: outputs whose errors are drawn, series that are told, effects with bars.
+#: Of any model: outputs whose errors are drawn, series with a sentence, effects with bars.
 _OUTPUTS, _SERIES, _EFFECTS = 4, 4, 16
 #: What a page shows of a stack, or of some diagnoses alone.
 _OF_STACK = (
     "stack", "answers", "views", "splits", "signatures", "columns", "gained", "blind", "noise",
     "moved", "most", "excess", "patch",
 )  # fmt: skip
-#: Views that say much the same: one of each family is drawn.
-_FAMILIES = {
-    "displacement": "voltage",
-    "since_reversal": "reversal",
-    "since_reversal_lag": "reversal",
-    "from_reversal": "reversal",
-    "amplitude_gain": "amplitude",
-    "amplitude_lag": "amplitude",
-    "frequency_gain": "frequency",
-    "frequency_lag": "frequency",
-}
-_STATUSES = {
-    "fit": "good",
-    "read off": "good",
-    "fit, weak": "weak",
-    "fit, undetermined": "bad",
-    "fit, on its bound": "bad",
-    "not fitted": "quiet",
-}
+#: Views that show nearly the same as another one: of these, and of gain and lag, one is drawn.
+_FAMILIES = {"displacement": "voltage", "from_reversal": "since_reversal"}
 
 
 def write_report(
@@ -88,7 +68,10 @@ def write_report(
 
     Raises InputError when `path` cannot be written to.
     """
-    atomic_write(path, _diagnosis_page(diagnosis, origin, still, model_file))
+    stack = diagnosis if isinstance(diagnosis, StackDiagnosis) else None
+    scale = phrases.scale_of(stack.experiments, stack.base_errors.holdout_rms_m) if stack else None
+    with phrases.one_unit(scale):
+        atomic_write(path, _page(diagnosis, stack, origin, still, model_file))
 
 
 def write_fit_report(
@@ -102,24 +85,15 @@ def write_fit_report(
     """Write the page of an identification, whole or not at all.
 
     It shows what the records determine, measured and model, and what the residual is.
-    `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` are shown
-    beside the determinacy. Unless it is to be `still`, the model runs in the page.
+    `origin`, "measured" or "synthetic", is what the page calls the records; `profiles` follow the
+    determinacy. Unless it is to be `still`, the model runs in the page.
 
     Raises InputError when `path` cannot be written to.
     """
     series = series_of_fit(identification)
     live = None if still else live_fit(identification, series)
-    atomic_write(
-        path, fit_page(identification, series, origin=origin, profiles=profiles, live=live)
-    )
-
-
-def _diagnosis_page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
-    stack = d if isinstance(d, StackDiagnosis) else None
-    if stack is None:
-        return _page(d, None, origin, still, model_file)
-    with phrases.one_unit(phrases.scale_of(d.experiments, stack.base_errors.holdout_rms_m)):
-        return _page(d, stack, origin, still, model_file)
+    page = fit_page(identification, series, origin=origin, profiles=profiles, live=live)
+    atomic_write(path, page)
 
 
 def _page(
@@ -129,13 +103,13 @@ def _page(
     live = None if still else live_diagnosis(d, series)  # compiles meanwhile
     gain = tables.error_table(d, series[0].residual_scale)
     by_record = len(d.experiments) > 1 and not stack
+    parts = _budget(d) | (_of_stack(stack) if stack else _of_any(d, series))
     about = f" of {plain(d.model.name)}" if not stack else ""
-    none = dict.fromkeys(_OF_STACK, ())
     return render(
         "diagnosis.html",
         f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
-        **_shared(d.model, series, d.experiments, origin),
-        **{**none, **_budget(d), **(_of_stack(stack) if stack else _of_any(d, series))},
+        **_shared(d, series, origin),
+        **{**dict.fromkeys(_OF_STACK, ()), **parts},
         d=d,
         added=added(d),
         verdict=verdict_words.verdict_sentence(d),
@@ -149,7 +123,11 @@ def _page(
                 "effect": effects[c.effect],
                 "size": verdict_words.cause_size(d, c),
                 "parameters": tables.parameter_table(d.model, only=c.parameters),
-                "alternatives": _alternatives(stack, c) if stack else [],
+                "alternatives": [
+                    f"{phrases.raised(verdict_words.alternative_sentence(d, a))}."
+                    for a in (stack.alternatives if stack else ())
+                    if a.cause == c.effect
+                ],
             }
             for c in d.causes
         ],
@@ -157,12 +135,6 @@ def _page(
         rest=phrases.rest_sentence(d),
         candidates=tables.candidate_table(d),
     )
-
-
-def _alternatives(d: StackDiagnosis, cause: Cause) -> list[str]:
-    """Say which models have another effect in a cause's place."""
-    items = [a for a in d.alternatives if a.cause == cause.effect]
-    return [f"{phrases.raised(verdict_words.alternative_sentence(d, a))}." for a in items]
 
 
 def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
@@ -173,20 +145,13 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
         f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
         for s, f in rows[:_SERIES]
     ]
-    return {
-        "errors": [
-            _bars(
-                d,
-                f"{e.output}: error on held-out samples, rms",
-                (e.base, e.extended, e.noise),
-                partial(phrases.with_its_unit, unit=e.unit),
-            )
-            for e in d.errors[:_OUTPUTS]
-        ],
-        "wrong": [[[d.missed.where, *wrong]], []],
-        "most": _EFFECTS,
-        "moved": d.moved,
-    }
+    errors = []
+    for e in d.errors[:_OUTPUTS]:
+        caption = f"{e.output}: error on held-out samples, rms"
+        in_unit = partial(phrases.with_its_unit, unit=e.unit)
+        errors.append(_bars(d, caption, (e.base, e.extended, e.noise), in_unit))
+    wrong = [d.missed.where, *wrong]
+    return {"errors": errors, "wrong": [[wrong], []], "most": _EFFECTS, "moved": d.moved}
 
 
 def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
@@ -196,20 +161,15 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     scale = phrases.scale_of(d.experiments, e.holdout_rms_m)
     reach = phrases.handy_scale(span, counts=scale.unit == "counts").text(span)
     sources = phrases.listing(list(dict.fromkeys(n.source for n in d.noise)))
+    estimated = f" It is estimated from: {sources}." if sources else ""
+    caption = f"Error on held-out samples, rms; the displacement's range is {reach}"
+    rms = e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m
     answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
     gained = verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
     own_voltages = added(d) and not d.gain.held_out_records
     return {
         "stack": True,
-        "errors": [
-            _bars(
-                d,
-                f"Error on held-out samples, rms; the displacement's range is {reach}",
-                (e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m),
-                scale.text,
-                f" It is estimated from: {sources}." if sources else "",
-            )
-        ],
+        "errors": [_bars(d, caption, rms, scale.text, estimated)],
         "answers": [f"{label}: {text}" for label, text in answers if text],
         "wrong": [
             [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
@@ -223,10 +183,7 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
         ],
         "signatures": [s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
         "columns": tables.column_table(d) if d.columns else None,
-        "gained": [
-            f"{phrases.raised(gained)}.",
-            *([verdict_words.OWN_VOLTAGES] if own_voltages else []),
-        ],
+        "gained": [f"{phrases.raised(gained)}.", *([verdict_words.OWN_VOLTAGES] * own_voltages)],
         "blind": tables.blind_table(d),
         "noise": [n.sentence for n in d.noise],
     }
@@ -246,7 +203,7 @@ def fit_page(
     """
     scale = max((s.residual_scale for s in series), key=lambda s: 1.0 / s.factor)
     stack = identification if isinstance(identification, StackIdentification) else None
-    with phrases.one_unit(scale) if stack else nullcontext():
+    with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
         graded, tiles = fit_words.grades(identification), []
         error = text.fit_sentence(identification) if stack is None else ""
@@ -266,10 +223,8 @@ def fit_page(
         return render(
             "fit.html",
             f"Identification of {'a stack' if stack else plain(identification.model.name)}",
-            **_shared(
-                identification.model, series, identification.experiments, origin, identification
-            ),
-            found=identification,
+            **_shared(identification, series, origin),
+            identification=identification,
             combinations=stack.combinations if stack else (),
             further=stack.advice if stack else (),
             verdict=f"{error} {fit_words.determined_sentence(graded)}",
@@ -278,14 +233,11 @@ def fit_page(
             determined=_determined(identification, graded),
             profiles=[
                 Picture(
-                    f"Profile of {p.name}",
-                    findings.profile_plot(p),
-                    " ".join(profile_sentences(p)),
+                    f"Profile of {p.name}", findings.profile_plot(p), " ".join(profile_sentences(p))
                 )
                 for p in profiles
             ],
             starts=tables.starts_table(identification.starts, series[0].residual_scale),
-            statuses=_STATUSES,
             errors=tables.fit_error_table(series, figures),
         )
 
@@ -296,13 +248,12 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
     Raises InputError when `path` cannot be written to.
     """
     experiments, name = posterior.task.experiments, plain(posterior.model.name)
-    count = len(experiments)
-    records = f"{count} record{'s' if count > 1 else ''}"
+    records = phrases.counted(len(experiments), "record")
     page = render(
         "posterior.html",
         f"Posterior of {name}",
         [records],
-        found=posterior,
+        posterior=posterior,
         verdict=f"The posterior of {name}, given {records}: {text.drawn(posterior)}.",
         figure=posterior_figure(posterior),
         parameters=text.posterior_table(posterior),
@@ -313,16 +264,14 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
 
 
 def _shared(
-    model: Model,
-    series: Sequence[Series],
-    experiments: Sequence[Experiment],
-    origin: str,
-    identification: Identification | None = None,
+    result: Diagnosis | Identification, series: Sequence[Series], origin: str
 ) -> dict[str, Any]:
-    """Return what pages of results show: the record that is missed most, every record, parameters.
+    """Return the parts of all pages of results: the worst record, all records, parameters.
 
-    On the page of a fit, `identification`, the former is only seen where no script runs.
+    On the page of a fit the former appears only if no script runs.
     """
+    model = result.model
+    identification = result if isinstance(result, Identification) else None
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
     worst = most_telling(series)
@@ -333,31 +282,26 @@ def _shared(
         records.time_plot(worst, origin, limit),
         f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
     )
-    known = fit_words.determined(
-        model, identification if isinstance(identification, StackIdentification) else None
-    )
+    stack = result if isinstance(result, StackIdentification) else None
+    known = fit_words.determined(model, stack)
     others = [n for n in model.parameter_names if n not in known]
-    count = len(experiments)
     return {
-        "badges": [f"{origin} data", f"{count} record{'s' if count > 1 else ''}"],
+        "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
         "origin": origin,
-        "worst": {
-            "name": worst.name,
-            "figure": record_figure(worst, origin=origin),
-            "picture": below,
-        },
+        "worst": worst,
+        "still": record_figure(worst, origin=origin),
+        "below": below,
         "parts": [
-            _part(
-                series[k], figures[k], origin, limit, identification or series[k].name != worst.name
-            )
-            for k in sorted(order[:MOST_RECORDS])
+            _part(s, figures[k], origin, limit, identification or s.name != worst.name)
+            for k, s in enumerate(series)
+            if k in order[:MOST_RECORDS]
         ],
         "count": len(series),
         "parameters": {
             name: tables.parameter_table(model, identification, only) if only else None
             for name, only in (("known", known), ("others", others))
         },
-        "used": tables.record_table(experiments, origin),
+        "used": tables.record_table(result.experiments, origin),
     }
 
 
@@ -373,7 +317,7 @@ def _shaded(s: Series) -> str:
 def _part(
     s: Series, figures: ResidualFigures, origin: str, limit: int, timed: Any
 ) -> dict[str, Any]:
-    """Return what is shown of a record: over time where it is `timed`, and the residual's views."""
+    """Return the views of a record and its residual; over time only if it is `timed`."""
     noise = "Dashed: two standard deviations of the noise."
     driver = s.against.partition(" [")[0]
     indices = records.samples(s, limit)
@@ -390,11 +334,8 @@ def _part(
         Picture("Distribution of the residual", records.distribution_plot(s),
                 "Dashed: normal distribution of the same mean and standard deviation."),
     ]  # fmt: skip
-    over_time = Picture(
-        f"{s.title}, and residual: {origin} minus model",
-        records.time_plot(s, origin, limit),
-        f"{noise}{_shaded(s)}",
-    )
+    caption = f"{s.title}, and residual: {origin} minus model"
+    over_time = Picture(caption, records.time_plot(s, origin, limit), f"{noise}{_shaded(s)}")
     return {
         "name": s.name,
         "title": s.title,
@@ -435,19 +376,19 @@ def _budget(d: Diagnosis) -> dict[str, Any]:
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
     """Return record and name of the views with the largest shares, one of every family.
 
-    "spectrum" stands for the lines that are not the drive's.
+    "spectrum" means the lines that are not the drive's.
     """
-    best: dict[str, tuple[float, Misfit, str]] = {}
+    rows: list[tuple[float, Misfit, str]] = []
     for m in misfits:
-        rows = [(v.name, v.share) for v in m.views if v.significant]
-        rows += [("holds", m.holds.share)] if m.holds and m.holds.significant else []
-        rows.append(("spectrum", m.spectrum.share))
-        for name, share in rows:
-            family = _FAMILIES.get(name, name)
-            if share > WORTH_SAYING and (family not in best or share > best[family][0]):
-                best[family] = (share, m, name)
-    order = sorted(best.values(), key=lambda row: -row[0])
-    return tuple((m, name) for _, m, name in order[:_VIEWS])
+        views = (*m.views, m.holds) if m.holds else m.views
+        rows += [(v.share, m, v.name) for v in views if v.significant]
+        rows.append((m.spectrum.share, m, "spectrum"))
+    best: dict[str, tuple[Misfit, str]] = {}
+    for share, m, name in sorted(rows, key=lambda row: -row[0]):
+        family = name.removesuffix("_gain").removesuffix("_lag")
+        if share > WORTH_SAYING:
+            best.setdefault(_FAMILIES.get(family, family), (m, name))
+    return tuple(best.values())[:_VIEWS]
 
 
 def _compared(d: StackDiagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
@@ -459,18 +400,16 @@ def _compared(d: StackDiagnosis, m: Misfit) -> tuple[Misfit | None, bool]:
 
 def _data_view(d: StackDiagnosis, m: Misfit, name: str) -> Picture | None:
     """Return the picture of one view of a record's residual, None where there is nothing in it."""
-    after, counts = _compared(d, m)
+    extended, counts = _compared(d, m)
     if name == "spectrum":
-        plot = findings.spectrum_view_plot(
-            m.spectrum, after.spectrum if after else None, counts=counts
-        )
+        lines = extended.spectrum if extended else None
+        plot = findings.spectrum_view_plot(m.spectrum, lines, counts=counts)
         return Picture(f"{m.record}: spectrum of the residual", plot)
     before = findings.view_named(m, name)
     if before is None:
         return None
-    plot = findings.view_plot(
-        before, findings.view_named(after, name) if after else None, counts=counts
-    )
+    after = findings.view_named(extended, name) if extended else None
+    plot = findings.view_plot(before, after, counts=counts)
     share = f", {phrases.percent(before.share)} of the excess" if before.significant else ""
     return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
 
@@ -494,21 +433,18 @@ def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Ta
 
 
 def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
-    """Return the signature of a cause beside the same view of the record that shows most of it."""
+    """Return the signature of a cause with the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None
-    observed = signature(effect)
-    view, note = observed.telling.name, size_sentence(observed)
+    expected = signature(effect)
+    view, note = expected.telling.name, size_sentence(expected)
     if view == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
     caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
-    pictures = [Picture(caption, findings.signature_plot(observed), note), _of_the_data(d, view)]
-    return {
-        "name": plain(name),
-        "looks_like": effect.looks_like,
-        "pictures": [p for p in pictures if p is not None],
-    }
+    pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
+    there = [p for p in pictures if p is not None]
+    return {"name": plain(name), "looks_like": effect.looks_like, "pictures": there}
 
 
 def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:

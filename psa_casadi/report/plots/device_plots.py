@@ -49,9 +49,9 @@ def difference_plot(findings: Sequence[Finding], rows: Sequence[Difference]) -> 
         for i, d in enumerate(rows):
             e = d.estimates
             if k in e.places:
-                item = e.places.index(k)
+                j = e.places.index(k)
                 mean = e.value(float(mixed_regression(e.theta, e.errors).b[0]))
-                ends = e.theta[item] + NORMAL_95 * e.errors[item] * np.array([0.0, -1.0, 1.0])
+                ends = e.theta[j] + NORMAL_95 * e.errors[j] * np.array([0.0, -1.0, 1.0])
                 percents = (100.0 * (e.value(float(t)) - mean) / (abs(mean) or 1.0) for t in ends)
                 points.append((i, *percents))
         if not points:
@@ -71,15 +71,15 @@ def difference_plot(findings: Sequence[Finding], rows: Sequence[Difference]) -> 
 
 def budget_plot(findings: Sequence[Finding]) -> Panel:
     """Shares of the base model's held-out error that each cause removes, one bar for a device."""
-    items = [f for f in findings if f.budget]
+    diagnosed = [f for f in findings if f.budget]
     title = "removed of the error's power above the noise [%]"
     plot = Panel(
-        title, height=130 + 34 * len(items), barmode="group" if len(items) < 3 else "stack"
+        title, height=130 + 34 * len(diagnosed), barmode="group" if len(diagnosed) < 3 else "stack"
     )
-    for k, what in enumerate(dict.fromkeys(s.what for f in items for s in f.budget)):
-        shares = [next((s.share for s in f.budget if s.what == what), 0.0) for f in items]
+    for k, what in enumerate(dict.fromkeys(s.what for f in diagnosed for s in f.budget)):
+        shares = [next((s.share for s in f.budget if s.what == what), 0.0) for f in diagnosed]
         plot.bars(
-            [100.0 * max(0.0, s) for s in shares], [f.device for f in items], plain(what),
+            [100.0 * max(0.0, s) for s in shares], [f.device for f in diagnosed], plain(what),
             _look(k)[0], width=0.6, hovertemplate="%{x:.0f} %<extra></extra>",
         )  # fmt: skip
     named = {"autorange": "reversed", "automargin": True, "showgrid": False, "type": "category"}
@@ -106,8 +106,8 @@ def error_plots(findings: Sequence[Finding]) -> tuple[Panel, Panel, Panel]:
         residual, stroke = small.factor * (x - y), length.factor * (x - np.nanmin(x))
         colour, dash, _ = _look(k)
         clocked = clock.factor * (time - time[0])
-        displayed = ((clocked, residual), (voltage, residual), (voltage, stroke))
-        for plot, (along, up) in zip(plots, displayed, strict=True):
+        curves = ((clocked, residual), (voltage, residual), (voltage, stroke))
+        for plot, (along, up) in zip(plots, curves, strict=True):
             plot.line(along, up, device, colour, 1.3, dash).axes(y={"automargin": True})
     return plots
 
@@ -119,7 +119,7 @@ def spread_plot(p: Population, s: Spread) -> Panel:
     names.
     """
     order = np.argsort(s.estimates.theta)
-    plot, displayed = _over_devices(p, s, np.arange(order.size), order, "devices, in order")
+    plot, in_unit = _over_devices(p, s, np.arange(order.size), order, "devices, in order")
     names = [p.findings[s.estimates.places[k]].device for k in order]
     if len(names) <= _MOST_TICKS:
         places = list(range(len(names)))
@@ -131,7 +131,7 @@ def spread_plot(p: Population, s: Spread) -> Panel:
     plot.axes({"tickvals": places, "ticktext": ticks, "automargin": True})
     mean = float(s.common.b[0])
     reach = NORMAL_95 * s.common.tau
-    middle, low, high = (float(v) for v in displayed(np.array([mean, mean - reach, mean + reach])))
+    middle, low, high = (float(v) for v in in_unit(np.array([mean, mean - reach, mean + reach])))
     return plot.across(middle, dash="solid", width=1.0).across(low, high, width=1.0)
 
 
@@ -150,11 +150,11 @@ def _over_devices(
     e = s.estimates
     unit = display_unit(e.name, e.unit)
 
-    def shown(theta: FloatArray) -> FloatArray:
+    def in_unit(theta: FloatArray) -> FloatArray:
         return np.array([float(convert(e.value(float(t)), e.unit, unit)) for t in theta])
 
     half = NORMAL_95 * e.errors[order]
-    middle, low, high = (shown(e.theta[order] + sign * half) for sign in (0.0, -1.0, 1.0))
+    middle, low, high = (in_unit(e.theta[order] + sign * half) for sign in (0.0, -1.0, 1.0))
     plot = Panel(title, in_brackets(e.name, unit if unit != "1" else ""), _HEIGHT)
     devices = np.array([p.findings[e.places[k]].device for k in order], dtype=object)
     apart = {o.device: abs(o.z) for o in p.outliers if o.parameter == e.name}
@@ -179,4 +179,4 @@ def _over_devices(
         )  # fmt: skip
         if which is far:
             plot.data[-1]["mode"] = "markers+text"
-    return plot.axes({"showgrid": False}, {"automargin": True}), shown
+    return plot.axes({"showgrid": False}, {"automargin": True}), in_unit

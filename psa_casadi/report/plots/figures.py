@@ -4,6 +4,7 @@ import os
 import textwrap
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ from psa_casadi.report.words.series import (
 )
 from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
-from psa_casadi.units import FloatArray, convert
+from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
 
 Compared = Diagnosis | Identification
@@ -60,7 +61,7 @@ _MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
 _COLUMNS = 4
 #: Outputs or columns of a record in one picture.
 _MOST_ROWS = 8
-#: A legend above the plot, beside its title, and one over the curves.
+#: A legend above the plot, right of its title, and one over the curves.
 _ABOVE = {
     "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
     "frameon": False, "columnspacing": 1.2, "handlelength": 1.4,
@@ -86,14 +87,17 @@ def save_figure(
     cannot be written to.
     """
     make = narrow_figure if narrow else diagnosis_figure
-    with atomic_path(path) as temporary:
-        make(diagnosis, origin=origin).savefig(temporary, format=picture_format(path))
+    write_figure(make(diagnosis, origin=origin), path)
 
 
-def picture_format(path: str | os.PathLike[str]) -> str:
-    """Return what the ending of a picture's name says: svg, pdf, else png."""
+def write_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a picture, whole or not at all: SVG or PDF where `path` ends so, else PNG.
+
+    Raises InputError when `path` cannot be written to.
+    """
     ending = Path(path).suffix.lower().removeprefix(".")
-    return ending if ending in ("svg", "pdf") else "png"
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format=ending if ending in ("svg", "pdf") else "png")
 
 
 def figure_of(result: Plotted) -> Figure:
@@ -102,8 +106,8 @@ def figure_of(result: Plotted) -> Figure:
         return diagnosis_figure(result)
     if isinstance(result, StackIdentification):
         series = series_of_fit(result)
-        figure, grid, displayed = _sheet(series, "measured", "model")
-        _draw_residual(figure.add_subplot(grid[1, :]), displayed)
+        figure, grid, worst = _sheet(series, "measured", "model")
+        _draw_residual(figure.add_subplot(grid[1, :]), worst)
         return figure
     if isinstance(result, Trajectory):
         return response_figure(result.time, result.voltage, result.displacement)
@@ -120,8 +124,8 @@ def figure_of(result: Plotted) -> Figure:
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
     verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
-    figure, grid, displayed = _sheet(series_of(diagnosis), origin, "base model", verdict)
-    _draw_residual(figure.add_subplot(grid[1, :2]), displayed)
+    figure, grid, worst = _sheet(series_of(diagnosis), origin, "base model", verdict)
+    _draw_residual(figure.add_subplot(grid[1, :2]), worst)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
     part = f" ({_MOST_BARS} of {count})" if count > _MOST_BARS else ""
@@ -172,25 +176,25 @@ def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
     return figure
 
 
-#: Lines that lie on each other are seen; and what an output is over its usual size that is none.
+#: Styles by which curves that coincide stay visible; the relative size of a zero response.
 _LINES, _NOTHING = ("-", "--", "-.", ":"), 1e-9
 
 
-def bode_figure(of: Linear) -> Figure:
+def bode_figure(linear: Linear) -> Figure:
     """Return gain and phase of every output over every input of a linearised model.
 
     A column for each input; frequencies from a decade below the slowest pole to one above the
     fastest.
     """
-    sizes = np.abs(of.poles)[np.abs(of.poles) > 0] / (2 * np.pi)
+    sizes = np.abs(linear.poles)[np.abs(linear.poles) > 0] / (2 * np.pi)
     low, high = (float(f(sizes)) if sizes.size else 1.0 for f in (np.min, np.max))
     hertz = np.geomspace(0.1 * low, 10.0 * high, 1500)
-    result = of.response(2 * np.pi * hertz)
-    figure = sheet((4.5 * max(2, len(of.inputs)), 7.0), DPI)
-    rows = figure.subplots(2, len(of.inputs), sharex=True, squeeze=False)
-    for k, i in enumerate(of.inputs):
-        for j, o in enumerate(of.outputs):
-            of_one = result[:, j, k]
+    response = linear.response(2 * np.pi * hertz)
+    figure = sheet((4.5 * max(2, len(linear.inputs)), 7.0), DPI)
+    rows = figure.subplots(2, len(linear.inputs), sharex=True, squeeze=False)
+    for k, i in enumerate(linear.inputs):
+        for j, o in enumerate(linear.outputs):
+            of_one = response[:, j, k]
             size, usual = (nominal_value(v.nominal, {}) for v in (i, o))
             if np.max(np.abs(of_one)) * size > _NOTHING * usual:  # else it is rounding
                 style_of = {"color": f"C{j}", "linestyle": _LINES[j % len(_LINES)]}
@@ -205,12 +209,6 @@ def bode_figure(of: Linear) -> Figure:
     rows[0, 0].set_ylabel("gain")
     rows[1, 0].set_ylabel("phase [degrees]")
     return figure
-
-
-def save_bode(of: Linear, path: str | os.PathLike[str]) -> None:
-    """Write the Bode picture of a linearised model, PNG, SVG or PDF as the name ends."""
-    with atomic_path(path) as temporary:
-        bode_figure(of).savefig(temporary, format=picture_format(path), dpi=DPI)
 
 
 def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatArray) -> Figure:
@@ -235,12 +233,10 @@ def _sheet(
     figure = sheet(SIZE_INCHES, DPI)
     ratios = {"height_ratios": (1.15, 1.0), "width_ratios": (1.0, 1.0, 0.95)}
     grid = figure.add_gridspec(2, 3, **ratios)
-    displayed, window = records.samples(s, _MOST_POINTS), telling_window(s)
+    indices, window = records.samples(s, _MOST_POINTS), telling_window(s)
     whole, part, loop = (figure.add_subplot(grid[0, k]) for k in range(3))
     draw(
-        whole,
-        records.measured_plot(s, origin, displayed),
-        f"{s.title} (box: the part on the right)",
+        whole, records.measured_plot(s, origin, indices), f"{s.title} (box: the part on the right)"
     )
     ends = s.time_scale.factor * s.time[window][[0, -1]]
     whole.axvspan(*ends, fill=False, edgecolor="black", linewidth=1.5, zorder=5)
@@ -249,7 +245,7 @@ def _sheet(
         "In the box, where the error falls most" if len(s.curves) > 1 else "The part in the box"
     )
     draw(part, records.zoom_plot(s, origin, _MOST_POINTS), inside, legend={})
-    draw(loop, records.loop_plot(s, origin, displayed), "Loop", legend={"loc": "upper left"})
+    draw(loop, records.loop_plot(s, origin, indices), "Loop", legend={"loc": "upper left"})
     which = f"{origin} record: {s.name}"
     if len(series) > 1:
         which += f" (the one of {len(series)} that the {model} misses most)"
@@ -335,17 +331,14 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         if name == "residual":
             _draw_residual(axes, most_telling(series))
         else:
-            displayed = most_telling([s for s in series if s.quantity == name])
-            whole = replace(displayed, held_out=np.zeros(len(displayed.time), dtype=bool))
+            worst = most_telling([s for s in series if s.quantity == name])
+            whole = replace(worst, held_out=np.zeros(len(worst.time), dtype=bool))
             draw(
-                axes,
-                records.measured_plot(whole, "measured", slice(None)),
-                displayed.title,
-                legend={},
+                axes, records.measured_plot(whole, "measured", slice(None)), worst.title, legend={}
             )
             axes.margins(x=0.01)
-    matches: Figure | SubFigure = axes.figure
-    return matches if isinstance(matches, Figure) else matches.figure
+    parent: Figure | SubFigure = axes.figure
+    return parent if isinstance(parent, Figure) else parent.figure
 
 
 def _series(result: Compared) -> tuple[Series, ...]:
@@ -363,13 +356,13 @@ def _chosen(output: str | None, there: Collection[str], usual: str) -> str:
 def _curve(axes: Axes, time: FloatArray, values: FloatArray, name: str, unit: str) -> None:
     """Draw values in their SI unit over time, in a handy one."""
     size = float(np.nanmax(np.abs(values), initial=0.0))
-    scale = phrases.handy_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
+    scale = phrases.any_scale(size, unit)
     label = phrases.in_brackets(name, scale.unit)
     draw(axes, Panel("time [s]", label).line(time, scale.factor * values, name))
 
 
 def posterior_figure(posterior: Posterior) -> Figure:
-    """Return what prior and posterior predict of the record missed most, and the parameters."""
+    """Return the predictive bands for the record with the largest misfit, and the parameters."""
     block = _missed_most(posterior)
     figures = posterior.figures[:_MOST_PARAMETERS]
     rows = -(-len(figures) // _COLUMNS)
@@ -402,12 +395,6 @@ def _missed_most(posterior: Posterior) -> Block:
     return max(posterior.task.density.blocks, key=share)
 
 
-def _scale(posterior: Posterior, b: Block, size: float) -> phrases.Scale:
-    """Return what numbers of a block of this size are shown in."""
-    unit = posterior.task.channel(b).unit
-    return phrases.length_scale(size) if unit == "m" else phrases.prefixed_scale(size, unit or "1")
-
-
 def _band(posterior: Posterior, group: str, b: Block) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the ends of the band that holds 94 % of what is predicted, and the median."""
     draws = posterior.tree[group][column_of(posterior.task, b)].to_numpy()
@@ -434,15 +421,15 @@ def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) 
         middle, name = np.zeros_like(y), posterior.task.channel(block).column
     ends = np.array([np.nanmin(y), np.nanmax(y)])
     size = 3.0 * np.ptp(ends) if is_prior else np.nanmax(np.abs(y - middle))
-    scale = _scale(posterior, block, float(size))
-    low, high, displayed = (scale.factor * (v - middle) for v in (low, high, y))
+    scale = phrases.any_scale(float(size), posterior.task.channel(block).unit)
+    low, high, measured = (scale.factor * (v - middle) for v in (low, high, y))
     if not is_prior:  # measured comes first in its legend
-        axes.plot(time, displayed, color=colours.MEASURED, linewidth=0.8, label="measured")
+        axes.plot(time, measured, color=colours.MEASURED, linewidth=0.8, label="measured")
     colour, alpha, order = look
     band = f"{group}, {100.0 * HDI:.0f} %"
     axes.fill_between(time, low, high, color=colour, alpha=alpha, label=band, zorder=order)
     if is_prior:
-        axes.plot(time, displayed, color=colours.MEASURED, linewidth=1.0, label="measured")
+        axes.plot(time, measured, color=colours.MEASURED, linewidth=1.0, label="measured")
         axes.set_ylim(*(scale.factor * (np.mean(ends) + np.array([-1.5, 1.5]) * np.ptp(ends))))
     style(axes, title, "time [s]", phrases.in_brackets(name, scale.unit))
     axes.legend(fontsize=FONT - 1, loc="upper right")
@@ -450,23 +437,22 @@ def _draw_predicted(axes: Axes, posterior: Posterior, block: Block, group: str) 
 
 def _draw_parameter(axes: Axes, posterior: Posterior, f: Figures) -> None:
     """Draw the posterior of a parameter, and its prior."""
-    unit, display = phrases.shown_in(posterior.model, f.name)
+    in_unit = partial(phrases.in_display_unit, posterior.model, f.name)
     values, before = (
-        np.array([convert(v, unit, display) for v in posterior.tree[g][f.name].to_numpy().ravel()])
-        for g in ("posterior", "prior")
+        np.array(in_unit(*posterior.tree[group][f.name].to_numpy().ravel())[1])
+        for group in ("posterior", "prior")
     )
+    unit, (mean, *interval) = in_unit(f.mean, f.low, f.high)
     axes.hist(values, bins=_BINS, density=True, color=colours.EXTENDED, alpha=0.7)
     low, high = axes.get_xlim()
     inside = before[(before >= low) & (before <= high)]
     if len(inside) >= 0.2 * max(len(before), 1):
         weights = np.full(len(inside), _BINS / (2.0 * (high - low) * len(before)))
         axes.hist(inside, bins=_BINS // 2, weights=weights, histtype="step", color=colours.BASE)
-    for end in (f.low, f.high):
-        axes.axvline(
-            convert(end, unit, display), color=colours.NOISE, linestyle="--", linewidth=1.0
-        )
-    title = f"{f.name} = {phrases.number(convert(f.mean, unit, display), 4)}"
-    style(axes, title, phrases.in_brackets(f.name, display), "")
+    for end in interval:
+        axes.axvline(end, color=colours.NOISE, linestyle="--", linewidth=1.0)
+    title = f"{f.name} = {phrases.number(mean, 4)}"
+    style(axes, title, phrases.in_brackets(f.name, unit), "")
     axes.set_yticks([])
 
 
@@ -474,7 +460,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     """Write the picture of an effect's signature, 1300 x 620 points, whole or not at all.
 
     It is an SVG or a PDF where `path` ends so, else a PNG. Left the difference over time above the
-    voltage's ghost, right against the coordinate that tells it best. Raises InputError when `path`
+    voltage's ghost, right against its most telling coordinate. Raises InputError when `path`
     cannot be written to.
     """
     figure = sheet((13.0, 6.2), DPI)
@@ -500,8 +486,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     draw(right, signature_plot(signature), textwrap.fill(title, 48), legend=legend)
     look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
     figure.suptitle(f"{look}\n{size_sentence(signature)}", fontsize=FONT + 1)
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, format=picture_format(path), dpi=DPI)
+    write_figure(figure, path)
 
 
 def size_sentence(signature: Signature) -> str:

@@ -1,7 +1,6 @@
-"""What is found: evidence of effects, views of a residual, signatures, what is determined."""
+"""Plots of findings: evidence of effects, views of a residual, signatures, determinacy."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -14,19 +13,14 @@ from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Degree, Grade
+from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.series import bar_colour
 from psa_casadi.units import FloatArray, convert
 
-_DEGREE_COLOURS: dict[Degree, str] = {
-    "determined": colours.EXTENDED,
-    "weak": colours.WEAK,
-    "undetermined": colours.BASE,
-    "on its bound": colours.BOUND,
-    "fixed": colours.NOISE,
-}
-#: The bars begin and end here [%]; what lies beyond says so in its figure.
+#: The colours of the degrees of determinacy, in their order.
+_DEGREE_COLOURS = (colours.EXTENDED, colours.WEAK, colours.BASE, colours.BOUND, colours.NOISE)
+#: The range of the bars [%]; a figure beyond it has a mark.
 _SHORTEST, _LONGEST = 0.01, 1000.0
 #: Heights of a bar, and of a plot's margins with its axis and legend.
 _BAR, _MARGINS = 22, 124
@@ -37,16 +31,16 @@ _LOW = 300
 _BEHIND, _SAMPLES = 1000, 3000
 #: Kinds of an unnamed correction that lie over another variable than the time.
 _CURVED = ("curve", "direction", "memory")
-#: The cost is shown up to this many limits; beyond, a curve only hides its foot.
+#: The end of the cost axis over the limit, so that the minimum stays readable.
 _TOP = 2.5
 _PARABOLA_POINTS = 81
 
 
 def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
-    """One bar for every effect that was tried; text says the share of the excess it explains.
+    """One bar for every effect that was tried, with the share of the excess that it explains.
 
     Named causes come first, with their confidence. Of many, the first and most telling ones where
-    only so many are to be drawn.
+    `most` limits them.
     """
     causes = {c.effect: c.confidence for c in d.causes}
     order = sorted(d.candidates, key=lambda c: c.effect not in causes)  # keeps the others' order
@@ -57,7 +51,7 @@ def evidence_plot(d: Diagnosis, most: int | None = None) -> Panel:
     fills = [bar_colour(c, set(causes)) for c in rows]
     plot = Panel("evidence [ln units], compressed", height=110 + 30 * len(rows), showlegend=False)
     plot.bars(values, names, "", fills, hoverinfo="skip")
-    # the figures stand to the right of bar and zero, clear of the names
+    # the figures are right of bar and zero, clear of the names
     figures = [f" {round(c.evidence):,}; {_figure(c, d)}" for c in rows]
     ends = [max(v, 0.0) for v in values]
     plot.texts(ends, names, figures, "middle right", cliponaxis=False)
@@ -120,13 +114,10 @@ def spectrum_view_plot(before: Spectrum, after: Spectrum | None, *, counts: bool
 
 def signature_plot(signature: Signature) -> Panel:
     """What an effect adds along its telling coordinate: samples behind their binned means."""
-    view, scale = (
-        signature.telling,
-        phrases.length_scale(float(np.max(np.abs(signature.difference)))),
-    )
+    view, largest = signature.telling, float(np.max(np.abs(signature.difference)))
+    scale = phrases.length_scale(largest)
     plot, factor = _view_panel(view, scale, "difference", [view.x])
     mean = scale.factor * view.mean
-    look: dict[str, Any] = {"line": {"color": colours.EXTENDED, "width": 1.8}}
     if view.name == "spectrum":
         top = float(np.max(mean))
         plot.line(factor * view.x, mean, "difference")
@@ -139,13 +130,14 @@ def signature_plot(signature: Signature) -> Panel:
     on = on[:: max(1, on.size // _BEHIND)]
     behind = factor * signature.coordinate[on], scale.factor * signature.counted[on]
     plot.marks(*behind, "samples", colours.NOISE, 3)
-    return plot.marks(factor * view.x, mean, "binned means", **look)
+    line = {"color": colours.EXTENDED, "width": 1.8}
+    return plot.marks(factor * view.x, mean, "binned means", line=line)
 
 
 def _view_panel(
     view: View, scale: phrases.Scale, what: str, arrays: list[FloatArray]
 ) -> tuple[Panel, float]:
-    """Return an empty plot of a view, and what its coordinate is multiplied by to be shown."""
+    """Return an empty plot of a view, and the factor from its coordinate to the axis."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
     plot = Panel(
         f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
@@ -166,8 +158,8 @@ def correction_plot(d: Diagnosis, c: Correction) -> tuple[str, Panel]:
     """
     if isinstance(c, FreeFunction):
         largest = float(np.max(np.abs(c.along), initial=0.0))
-        observed = phrases.prefixed_scale(largest, c.variable_unit or "1")
-        at, added, name, unit = observed.factor * c.along, c.added, c.variable, observed.unit
+        coordinate = phrases.prefixed_scale(largest, c.variable_unit or "1")
+        at, added, name, unit = coordinate.factor * c.along, c.added, c.variable, coordinate.unit
         scale = phrases.prefixed_scale(float(np.max(np.abs(added), initial=0.0)), c.unit)
     elif isinstance(c, Patch):
         k = max(range(len(c.added)), key=lambda i: float(np.std(c.added[i])))
@@ -197,15 +189,15 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
     """One bar for every parameter: its standard error over its value, on a logarithmic axis."""
     fitted = sorted((g for g in graded if g.degree != "fixed"), key=lambda g: g.error)
     rows = [*fitted, *(g for g in graded if g.degree == "fixed")]
-    items = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
-    left = 10.0 ** math.floor(math.log10(min([1.0, *items]) * 0.5))
-    right = max([100.0, *items]) * 15.0
+    percents = [min(max(100.0 * g.error, _SHORTEST), _LONGEST) for g in fitted]
+    left = 10.0 ** math.floor(math.log10(min([1.0, *percents]) * 0.5))
+    right = max([100.0, *percents]) * 15.0
     plot = Panel("relative standard error [%]", height=_MARGINS + _BAR * len(rows))
-    for degree in DEGREES:
-        group = [(g, x) for g, x in zip(fitted, items, strict=True) if g.degree == degree]
+    for degree, colour in zip(DEGREES, _DEGREE_COLOURS, strict=True):
+        group = [(g, x) for g, x in zip(fitted, percents, strict=True) if g.degree == degree]
         if group:
             names = [g.name for g, _ in group]
-            plot.bars([x for _, x in group], names, degree, _DEGREE_COLOURS[degree], width=0.66,
+            plot.bars([x for _, x in group], names, degree, colour, width=0.66,
                       hovertemplate="%{y}: %{x:.3g} %<extra></extra>")  # fmt: skip
     inks = [colours.NOISE if g.degree == "fixed" else colours.INK for g in rows]
     figures = [
@@ -229,26 +221,22 @@ def determinacy_plot(graded: tuple[Grade, ...]) -> Panel:
 def correlation_plot(identification: Identification) -> Panel:
     """Correlations of the estimates as a square of colours, strong ones with their figure."""
     names, matrix = list(identification.determinacy.names), identification.determinacy.correlations
-    written, rows = (
-        len(names) <= _MOST_FIGURES,
-        max(10, len(identification.model.structure.parameters)),
-    )
+    has_figures = len(names) <= _MOST_FIGURES
+    rows = max(10, len(identification.model.structure.parameters))
     plot = Panel(height=_MARGINS + _BAR * min(rows, 2 * len(names) + 2))
     cells = [(i, k, float(np.clip(matrix[i, k], -1.0, 1.0)))
              for i in range(len(names)) for k in range(i + 1)]  # fmt: skip
-    for sign, colour, statement in (
-        (1.0, colours.EXTENDED, "positive"),
-        (-1.0, colours.BASE, "negative"),
-    ):
-        items = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
-        look = {"color": colour, "opacity": [abs(v) for _, _, v in items]}
-        plot.bars(  # a cell is a bar that begins at its column
-            [0.92] * len(items), [names[i] for i, _, _ in items], statement, look, width=0.92,
-            base=[k - 0.46 for _, k, _ in items],
-            text=[_correlation_text(v) if written and i > k else "" for i, k, v in items],
+    signs = ((1.0, colours.EXTENDED, "positive"), (-1.0, colours.BASE, "negative"))
+    for sign, colour, name in signs:
+        part = [(i, k, v) for i, k, v in cells if sign * v > 0.0]
+        look = {"color": colour, "opacity": [abs(v) for _, _, v in part]}
+        plot.bars(  # a cell is a bar with its base at its column
+            [0.92] * len(part), [names[i] for i, _, _ in part], name, look, width=0.92,
+            base=[k - 0.46 for _, k, _ in part],
+            text=[_correlation_text(v) if has_figures and i > k else "" for i, k, v in part],
             textposition="inside", insidetextanchor="middle", textangle=0, constraintext="none",
             textfont={"size": 10, "color": colours.INK},
-            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in items],
+            hovertext=[f"{names[i]} and {names[k]}: {v:.3f}" for i, k, v in part],
             hovertemplate="%{hovertext}<extra></extra>",
         )  # fmt: skip
     bare = {"showgrid": False, "ticks": "", "mirror": False, "showline": False, "automargin": True}
@@ -280,14 +268,14 @@ def profile_plot(p: Profile) -> Panel:
     plot = Panel(f"{p.name}{unit}", "increase of the cost", 380)
     plot.marks(values, p.increase, "all other parameters fitted anew",
                line={"color": colours.EXTENDED, "width": 2.0})  # fmt: skip
-    if p.log:  # what the standard error alone says, in the logarithm where it has one
+    if p.log:  # the linearised interval, in the logarithm where it has one
         at = np.geomspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = np.log(at / p.estimate) * p.estimate / p.standard_error
     else:
         at = np.linspace(p.values[0], p.values[-1], _PARABOLA_POINTS)
         away = (at - p.estimate) / p.standard_error
-    displayed = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
-    plot.line(displayed, away**2, "linearised", colours.NOISE, dash="dot")
+    values_at = np.array([convert(float(v), p.unit, p.display_unit) for v in at])
+    plot.line(values_at, away**2, "linearised", colours.NOISE, dash="dot")
     low, high = (
         edge if end is None else convert(end, p.unit, p.display_unit)
         for end, edge in ((p.low, span[0]), (p.high, span[1]))

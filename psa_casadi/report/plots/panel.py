@@ -65,13 +65,13 @@ class Panel:
         self, x: Any, y: Any, name: str = "", colour: str = colours.EXTENDED, size: float = 6,
         symbol: str = "circle", **more: Any,
     ) -> "Panel":  # fmt: skip
-        """Add markers, and where `line` is given a line through them."""
+        """Add markers, and with `line` a line through them."""
         look = {"color": colour, "size": size, "symbol": symbol}
         mode = "lines+markers" if "line" in more else "markers"
         return self._scatter(mode, x, y, name, marker=look, **more)
 
     def texts(self, x: Any, y: Any, texts: Sequence[str], position: str, **more: Any) -> "Panel":
-        """Add texts beside points."""
+        """Add texts next to points."""
         return self._scatter(
             "text", x, y, "", text=list(texts), textposition=position, hoverinfo="skip", **more
         )
@@ -90,19 +90,15 @@ class Panel:
         width: float = 1.2,
     ) -> "Panel":  # fmt: skip
         """Add lines over the whole width."""
-        ends = {"xref": "x domain", "x0": 0, "x1": 1}
-        for y in heights:
-            self._shape(name, {**ends, "y0": y, "y1": y}, (colour, dash, width))
-        return self
+        ends, look = {"xref": "x domain", "x0": 0, "x1": 1}, (colour, dash, width)
+        return self._lines(name, [{**ends, "y0": y, "y1": y} for y in heights], look)
 
     def upright(
         self, *places: float, colour: str = colours.AXIS, dash: str = "dot", width: float = 1.2
     ) -> "Panel":
         """Add lines over the whole height."""
-        ends = {"yref": "y domain", "y0": 0, "y1": 1}
-        for x in places:
-            self._shape("", {**ends, "x0": x, "x1": x}, (colour, dash, width))
-        return self
+        ends, look = {"yref": "y domain", "y0": 0, "y1": 1}, (colour, dash, width)
+        return self._lines("", [{**ends, "x0": x, "x1": x} for x in places], look)
 
     def bands(self, spans: Iterable[tuple[float, float]], name: str = "") -> "Panel":
         """Shade stretches over the whole height."""
@@ -126,9 +122,12 @@ class Panel:
                           "showlegend": bool(name), **more})  # fmt: skip
         return self
 
-    def _shape(self, name: str, place: Settings, look: tuple[str, str, float]) -> None:
+    def _lines(
+        self, name: str, places: Iterable[Settings], look: tuple[str, str, float]
+    ) -> "Panel":
         line = dict(zip(("color", "dash", "width"), look, strict=True))
-        self.layout["shapes"].append({"type": "line", "name": name, "line": line, **place})
+        self.layout["shapes"] += [{"type": "line", "name": name, "line": line, **p} for p in places]
+        return self
 
 
 def stacked(above: Panel, below: Panel, height: int) -> Panel:
@@ -159,9 +158,9 @@ def logarithmic(values: tuple[float, float]) -> dict[str, Any]:
 
 
 def plotly_figure(panel: Panel, hold: Callable[[str], Any] = str) -> dict[str, Any]:
-    """Return what plotly reads; `hold` keeps a long array and returns what stands for it."""
-    table: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
-    return table
+    """Return the figure for plotly; `hold` stores a long array and returns its key."""
+    content: dict[str, Any] = _encoded({"data": panel.data, "layout": panel.layout}, "", hold)
+    return content
 
 
 def _encoded(value: Any, key: str, hold: Callable[[str], Any]) -> Any:
@@ -188,7 +187,7 @@ def label(name: str) -> str:
 
 
 def sheet(size: tuple[float, float], dpi: float, **how: Any) -> Figure:
-    """Return an empty picture of so many inches."""
+    """Return an empty picture of a size in inches."""
     figure = Figure(figsize=size, dpi=dpi, **{"layout": "constrained", **how})
     FigureCanvasAgg(figure)
     return figure
@@ -220,9 +219,9 @@ def style(axes: Axes, title: str, x: str, y: str, *, font: float = FONT) -> None
 
 
 def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
-    displayed = t["name"] if t.get("showlegend", True) else None
+    label_text = t["name"] if t.get("showlegend", True) else None
     if t["type"] == "bar":
-        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=displayed)
+        axes.barh(t["y"], t["x"], color=t["marker"]["color"], label=label_text)
         return
     if t["mode"] == "text":
         for x, y, text in zip(t["x"], t["y"], t["text"], strict=True):
@@ -232,7 +231,7 @@ def _draw_trace(axes: Axes, t: Settings, font: float) -> None:
     look = line or marker or {}
     errors = t.get("error_y")
     axes.errorbar(
-        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=displayed,
+        t["x"], t["y"], yerr=None if errors is None else errors["array"], label=label_text,
         color=look["color"], linestyle=_DASHES[line.get("dash", "solid")] if line else "none",
         linewidth=_POINTS * line["width"] if line else 0.0, elinewidth=0.8,
         marker=_SYMBOLS[marker.get("symbol", "circle")] if marker else None,

@@ -1,4 +1,4 @@
-"""What is seen of one record: time, loop, window, and the residual in several views."""
+"""Plots of one record: over time, loop, window, and the residual in several views."""
 
 import numpy as np
 
@@ -9,10 +9,10 @@ from psa_casadi.units import FloatArray, IndexArray
 
 Samples = slice | IndexArray
 
-#: Points of a part of a record, measured samples shown one by one, and of a spectrum.
+#: Points of a part of a record, and of a spectrum.
 _ZOOM_POINTS, _SPECTRUM_POINTS = 1500, 800
 _FULL = 500
-#: A residual is far off if it is so many times wider than the one that is to be read.
+#: Ratio of widths from which on a residual is too wide for the axis of the last one.
 _FAR = 6.0
 
 
@@ -30,44 +30,44 @@ def time_plot(s: series.Series, origin: str, limit: int) -> Panel:
     return stacked(measured_plot(s, origin, indices), residual_plot(s, indices), _FULL)
 
 
-def measured_plot(s: series.Series, origin: str, displayed: Samples) -> Panel:
+def measured_plot(s: series.Series, origin: str, indices: Samples) -> Panel:
     """What was measured over time, and the models."""
     clock = s.time_scale
     plot = Panel(f"time [{clock.unit}]", s.label)
     return _with_held_out(
-        _measured(plot, clock.factor * s.time[displayed], s, origin, displayed, 1.4), s
+        _measured(plot, clock.factor * s.time[indices], s, origin, indices, 1.4), s
     )
 
 
-def residual_plot(s: series.Series, displayed: Samples) -> Panel:
+def residual_plot(s: series.Series, indices: Samples) -> Panel:
     """What the models leave over time, with the noise."""
     clock = s.time_scale
     plot = Panel(f"time [{clock.unit}]", in_brackets("residual", s.residual_scale.unit))
-    return _with_held_out(_residuals(plot, clock.factor * s.time[displayed], s, displayed, 1.0), s)
+    return _with_held_out(_residuals(plot, clock.factor * s.time[indices], s, indices, 1.0), s)
 
 
 def zoom_plot(s: series.Series, origin: str, limit: int) -> Panel:
-    """What was measured over time in the window where the curves are easiest to tell apart."""
+    """What was measured over time in the window where the curves differ most."""
     window = series.telling_window(s)
-    displayed = np.arange(len(s.time))[window]
-    displayed = displayed[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
-    time, y = s.time_scale.factor * s.time[displayed], s.scale.factor * s.measured[displayed]
+    indices = np.arange(len(s.time))[window]
+    indices = indices[series.kept([s.measured[window]], min(limit // 2, _ZOOM_POINTS))]
+    time, y = s.time_scale.factor * s.time[indices], s.scale.factor * s.measured[indices]
     plot = Panel(f"time [{s.time_scale.unit}]", s.label)
     thin = {"color": colours.NOISE, "width": 0.7}
     plot.marks(time, y, origin, colours.MEASURED, 4, line=thin)
-    return _models(plot, time, s, displayed, 2.2)
+    return _models(plot, time, s, indices, 2.2)
 
 
-def loop_plot(s: series.Series, origin: str, displayed: Samples) -> Panel:
+def loop_plot(s: series.Series, origin: str, indices: Samples) -> Panel:
     """What was measured over what drives it, such as displacement over voltage."""
-    return _measured(Panel(s.against, s.label), s.voltage[displayed], s, origin, displayed, 1.2)
+    return _measured(Panel(s.against, s.label), s.voltage[indices], s, origin, indices, 1.2)
 
 
 def error_loop_plot(s: series.Series, limit: int) -> Panel:
     """Residual over what drives the model: where in the loop the model goes wrong."""
-    displayed, label = samples(s, limit), in_brackets("residual", s.residual_scale.unit)
+    indices, label = samples(s, limit), in_brackets("residual", s.residual_scale.unit)
     plot = Panel(s.against, label, showlegend=len(s.curves) > 1)
-    return _residuals(plot, s.voltage[displayed], s, displayed, 0.9)
+    return _residuals(plot, s.voltage[indices], s, indices, 0.9)
 
 
 def spectrum_plot(s: series.Series, limit: int) -> Panel:
@@ -104,7 +104,7 @@ def autocorrelation_plot(s: series.Series) -> Panel:
 
 
 def distribution_plot(s: series.Series) -> Panel:
-    """Share of samples over the size of every curve's residual, beside a normal distribution.
+    """Share of samples over the size of every curve's residual, with a normal distribution.
 
     Where the others are far off, the axis is that of the last one; their names say how much of
     them lies outside.
@@ -134,26 +134,24 @@ def distribution_plot(s: series.Series) -> Panel:
 
 
 def _measured(
-    plot: Panel, x: FloatArray, s: series.Series, origin: str, displayed: Samples, width: float
+    plot: Panel, x: FloatArray, s: series.Series, origin: str, indices: Samples, width: float
 ) -> Panel:
-    plot.line(x, s.scale.factor * s.measured[displayed], origin, colours.MEASURED, 3.0)
-    return _models(plot, x, s, displayed, width)
+    plot.line(x, s.scale.factor * s.measured[indices], origin, colours.MEASURED, 3.0)
+    return _models(plot, x, s, indices, width)
 
 
-def _models(
-    plot: Panel, x: FloatArray, s: series.Series, displayed: Samples, width: float
-) -> Panel:
+def _models(plot: Panel, x: FloatArray, s: series.Series, indices: Samples, width: float) -> Panel:
     for curve in s.curves:
-        plot.line(x, s.scale.factor * curve.values[displayed], curve.label, curve.colour, width)
+        plot.line(x, s.scale.factor * curve.values[indices], curve.label, curve.colour, width)
     return plot
 
 
 def _residuals(
-    plot: Panel, x: FloatArray, s: series.Series, displayed: Samples, width: float
+    plot: Panel, x: FloatArray, s: series.Series, indices: Samples, width: float
 ) -> Panel:
     """Add what the models leave, with the noise."""
     for curve in s.curves:
-        residual = s.residual_scale.factor * s.residual(curve)[displayed]
+        residual = s.residual_scale.factor * s.residual(curve)[indices]
         plot.line(x, residual, curve.label, curve.colour, width)
     edge = 2.0 * s.residual_scale.factor * s.noise
     return plot.across(-edge, edge, name="noise (2 sigma)") if edge > 0.0 else plot

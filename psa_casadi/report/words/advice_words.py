@@ -64,8 +64,8 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     "interrupted": "The search was interrupted; this is the best fit so far, and its values are not"
     " final.",
     "not_unique": lambda names: (
-        f"Two starts led to equally good fits that differ in {quoted(names)}: these records cannot"
-        " tell which is right."
+        f"Two starts led to equally good fits that differ in {quoted(names)}: these records do"
+        " not decide which is right."
     ),
     "undetermined": lambda names: (
         f"{quoted(names)} {'is' if len(names) == 1 else 'are'} not determined by these records."
@@ -85,7 +85,7 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
     "column": "{column}: fitted beside the displacement; {rms:.3g}{unit} rms of it are missed,"
     " {share:.2g} % of its own rms.",
     "turned_column": "{column} falls where the model's rises: its sign is probably turned.",
-    "capacitance": "The measured {source} tells C_p = {value:.4g} uF ({low:.4g} to {high:.4g};"
+    "capacitance": "The measured {source} gives C_p = {value:.4g} uF ({low:.4g} to {high:.4g};"
     " times the amplifier's gain, if the voltage is its input): it explains {share:.1f} % of it.",
     "capacitance_kept": "The model keeps the {value:.4g} uF given.",
     "two_clocks": f"{_TWO_CLOCKS}.",
@@ -175,7 +175,7 @@ IDENTIFICATION: Mapping[str, str | Callable[..., str]] = {
         " cause."
     ),
     "of_the_prior": lambda names: (
-        f"The records hardly tell {quoted(names)}: the posterior is that of the prior."
+        f"The records hardly determine {quoted(names)}: the posterior is that of the prior."
     ),
     "prior_fails": "{count} of {draws} draws of the prior cannot be simulated; they are left out"
     " of the prior's groups.",

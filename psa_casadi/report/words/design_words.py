@@ -8,17 +8,16 @@ from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, S
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
 from psa_casadi.report.words.phrases import (
+    in_display_unit,
     interval_text,
     listing,
     number,
     percent,
     plain,
     probability_text,
-    shown_in,
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.start import is_stack
-from psa_casadi.units import convert
 
 _FAMILIES = {
     "free": "free-form, linear between corners",
@@ -43,26 +42,24 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
     """Return what the design promises, and what it asks of the amplifier."""
     model = design.rivals[0].model
     capacitance = model.values.get("C_p") if is_stack(model) else None
-    statement = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
+    promises = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
     record, parts = design.record, []
     for name, values in record.columns.items():
-        unit, rate = (
-            record.units[name],
-            float(np.max(np.abs(np.diff(values) / np.diff(record.time)))),
-        )
+        unit = record.units[name]
+        rate = float(np.max(np.abs(np.diff(values) / np.diff(record.time))))
         current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
-        displayed = "" if unit == "1" else f" {unit}"
-        each = f"{displayed} a second" if displayed == "" or "/" in unit else f"{displayed}/s"
+        in_unit = "" if unit == "1" else f" {unit}"
+        per_second = f"{in_unit} a second" if in_unit == "" or "/" in unit else f"{in_unit}/s"
         named = f"{name} " if len(record.columns) > 1 else ""
         parts.append(
-            f"{named}{number(values.min())} to {number(values.max())}{displayed}, at most"
-            f" {number(rate)}{each}{current}"
+            f"{named}{number(values.min())} to {number(values.max())}{in_unit}, at most"
+            f" {number(rate)}{per_second}{current}"
         )
     inputs = (
         f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
         f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
     )
-    return (*statement, inputs)
+    return (*promises, inputs)
 
 
 def _chances(design: Separated) -> tuple[str, ...]:
@@ -132,17 +129,13 @@ def _intervals(design: Informative) -> Table:
     """Return the predicted 95 % interval of every chosen parameter, before and after."""
     rows, model = [], design.rivals[0].model
     for name, after in design.intervals.items():
-        unit, display = shown_in(model, name)
-        cells = (
-            interval_text(*(convert(v, unit, display) for v in ends))
-            for ends in (design.before[name], after)
-        )
-        value = number(convert(model.values[name], unit, display), 4)
+        values = (model.values[name], *design.before[name], *after)
+        unit, (value, *ends) = in_display_unit(model, name, *values)
         half = 0.5 * (after[1] - after[0]) / max(abs(model.values[name]), 1e-300)
-        output = half < 10 and after != model.parameter(name).bounds
-        rows.append(
-            (name, value, display, *cells, f"{number(100.0 * half, 2)} %" if output else "open")
-        )
+        bounded = half < 10 and after != model.parameter(name).bounds
+        width = f"{number(100.0 * half, 2)} %" if bounded else "open"
+        intervals = interval_text(*ends[:2]), interval_text(*ends[2:])
+        rows.append((name, number(value, 4), unit, *intervals, width))
     head = ("parameter", "value", "unit", "known before", "95 % interval after", "half width")
     return Table(head, tuple(rows))
 
@@ -187,7 +180,7 @@ def _pole(pole: complex) -> str:
 
 
 def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
-    """Return the result in sentences: reached or not, what stands in the way, the lag's pole."""
+    """Return the result in sentences: reached or not, the binding limits, the lag's pole."""
     wanted = " and ".join(d.goals)
     if d.attained:
         first = f"Wanted {wanted}: reached within the limits."
@@ -212,7 +205,7 @@ def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
 
 
 def error_table(rows: list[tuple[str, TrackingError]]) -> Titled:
-    """Return errors in percent of the path's range, rms and largest, by who says so."""
+    """Return errors in percent of the path's range, rms and largest, by source."""
     body = tuple((n, number(e.rms_percent), number(e.largest_percent)) for n, e in rows)
     return Titled("Errors", Table(("voltage, judged by", "rms [% of range]", "largest [%]"), body))
 

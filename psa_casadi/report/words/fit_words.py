@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal, get_args
 
 from psa_casadi.identification.determinacy import DETERMINED_WIDTH
@@ -58,17 +59,15 @@ def grade(identification: Identification, name: str) -> Grade:
     return Grade(name, error, degree, by_change=not parameter.log)
 
 
-def determined(
-    model: Model, stack_identification: StackIdentification | None = None
-) -> frozenset[str]:
+def determined(model: Model, identification: StackIdentification | None = None) -> frozenset[str]:
     """Return the parameters that the records determine, if only weakly.
 
-    Without the identification that found them they are those whose 95 % interval is that of a
+    Without an identification they are those whose 95 % interval is that of a
     standard error below `DETERMINED_WIDTH`.
     """
-    if stack_identification is not None:
-        known = {g.name for g in grades(stack_identification) if g.degree in ("determined", "weak")}
-        return frozenset(known | set(stack_identification.read_off))
+    if identification is not None:
+        known = {g.name for g in grades(identification) if g.degree in ("determined", "weak")}
+        return frozenset(known | set(identification.read_off))
     narrow = set()
     for name, interval in model.provenance.intervals.items():
         parameter = model.parameter(name)
@@ -89,17 +88,14 @@ def named(graded: tuple[Grade, ...], degree: Degree) -> list[str]:
 def strong_pairs(identification: Identification) -> list[tuple[str, str, float]]:
     """Return the pairs of parameters that are known only together, the strongest first."""
     names, matrix = identification.determinacy.names, identification.determinacy.correlations
-    pairs = [
-        (names[i], names[k], float(matrix[i, k]))
-        for i in range(len(names))
-        for k in range(i + 1, len(names))
-        if abs(matrix[i, k]) >= STRONG_CORRELATION
-    ]
+    places = combinations(range(len(names)), 2)
+    strong = [(i, k) for i, k in places if abs(matrix[i, k]) >= STRONG_CORRELATION]
+    pairs = [(names[i], names[k], float(matrix[i, k])) for i, k in strong]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 
 #: Shares of the lags beyond the 95 % band up to which a residual passes for white, with the
-#: correlation of neighbours that no eye tells from none.
+#: correlation of neighbours that is negligible.
 _WHITE_SHARE, _WHITE_NEIGHBOURS = 0.12, 0.05
 _SHAPE = 0.5
 
@@ -151,11 +147,11 @@ def pairs_sentence(pairs: list[tuple[str, str, float]]) -> str:
     """Say which parameters are known only together."""
     if not pairs:
         return f"No two estimates correlate by more than {STRONG_CORRELATION}."
-    items = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
+    texts = [f"{a} with {b} ({_signed(r)})" for a, b, r in pairs[:6]]
     more = f", and {len(pairs) - 6} pairs more" if len(pairs) > 6 else ""
     return (
         "Known only together, since one can make up for a change of the other:"
-        f" {', '.join(items)}{more}."
+        f" {', '.join(texts)}{more}."
     )
 
 

@@ -1,4 +1,4 @@
-"""The sentences of notes: what each code says, with the note's values in its places."""
+"""The sentences of notes by code, with the note's values in their places."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -9,8 +9,7 @@ from psa_casadi.errors import quoted
 from psa_casadi.identification.result import Identification
 from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
-from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT
-from psa_casadi.report.words.noise_words import NOISE
+from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT, NOISE
 from psa_casadi.report.words.phrases import (
     are,
     listing,
@@ -228,7 +227,7 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " that doubles to noise alone, and most held-out samples lose by it"
     ),
     "no_such_voltage": (
-        "no stack bears such a voltage, and what depends on its level cannot be told"
+        "no stack bears such a voltage, and what depends on its level cannot be determined"
     ),
     "other_quantity": "much would remain, and the displacement may be another quantity",
     "held_out_says_little": lambda why: f"{raised(str(why))}: the held-out error says little.",
@@ -310,8 +309,8 @@ DIAGNOSIS: Mapping[str, str | Callable[..., str]] = {
         " column (current, charge, a second displacement)."
     ),
     "same_curve": (
-        "{effects: and } bend the same curve: no voltage below the resonances tells one from"
-        " another. Measure the displacement with a second sensor (column displacement_2) or the"
+        "{effects: and } bend the same curve: no voltage below the resonances separates"
+        " them. Measure the displacement with a second sensor (column displacement_2) or the"
         " load's force (load_force), elsewhere in the range of this sensor, or without the load;"
         " or sample fast enough to excite and see the resonances."
     ),
@@ -329,12 +328,12 @@ def _identification(identification: Identification) -> str:
         f"  {n}: {v:.3g} rms left, noise {identification.noise[n]:.3g}"
         for n, v in identification.rms.items()
     ]
-    items = [f"  {w}" for w in identification.warnings]
-    return "\n".join([f"identified '{model.name}':", *rows, *left, *items])
+    warnings = [f"  {w}" for w in identification.warnings]
+    return "\n".join([f"identified '{model.name}':", *rows, *left, *warnings])
 
 
 def _estimate(value: float, low: float, high: float) -> str:
-    """Return a value with its interval, in as many digits as tell them apart, four at least."""
+    """Return a value with its interval, in as many digits as distinguish them, four at least."""
     half = max(high - value, value - low)
     digits = 4
     if 0.0 < half < abs(value):
@@ -364,8 +363,8 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
     ),
     "hold_found": lambda hold, nats: (
         f"The inputs are {'held' if hold == 'zero' else 'straight lines'} between samples, which"
-        f" explains the records better (ln of the likelihood higher by {nats:.0f}). Nobody said so;"
-        f" if you know better, say --hold {'linear' if hold == 'zero' else 'zero'}."
+        f" explains the records better (ln of the likelihood higher by {nats:.0f}). This is an"
+        f" estimate; if you know better, give --hold {'linear' if hold == 'zero' else 'zero'}."
     ),
     "inputs_smoothed": lambda inputs, nats: (
         f"The readings of {listing(inputs)} are noisy, and the noise is not what drove the device:"
@@ -420,20 +419,14 @@ OWN_MODELS: Mapping[str, str | Callable[..., str]] = {
 
 #: A code's sentence: a template with the values' names, or what makes it of the values.
 Sentence = str | Callable[..., str]
-SENTENCES: Mapping[str, Sentence] = {
-    **DIAGNOSIS,
-    **IDENTIFICATION,
-    **MISFIT,
-    **NOISE,
-    **OWN_MODELS,
-}
+SENTENCES: Mapping[str, Sentence] = {**DIAGNOSIS, **IDENTIFICATION, **MISFIT, **NOISE, **OWN_MODELS}
 
 
 class _Words(Formatter):
     """Formats quantities `(value, unit)` with their units, and names in a row.
 
     What follows the colon is a number's format, ".0p" that of a percentage without its sign, or
-    what stands between names, ", " by default.
+    the separator of names, ", " by default.
     """
 
     def format_field(self, value: Any, format_spec: str) -> str:

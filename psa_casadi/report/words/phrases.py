@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
+from psa_casadi.units import convert
 
-#: A length in a sentence stays in its own unit where the page's would give a larger number.
+#: A length in a sentence keeps its usual unit where the page's would give a larger number.
 _LARGEST = 1000.0
 #: Units of quantities in sentences, the largest first, and the least value that each is for.
 _IN_SENTENCES: dict[str, tuple[tuple[str, float], ...]] = {
@@ -27,7 +28,7 @@ _PREFIXES = (("M", 1e6), ("k", 1e3), ("", 1.0), ("m", 1e-3), ("µ", 1e-6), ("n",
 
 @dataclass(frozen=True)
 class Scale:
-    """A unit to show a length in: `shown = factor * metres` (counts are shown as they are)."""
+    """A unit to show a length in: `number = factor * metres`; counts stay counts."""
 
     unit: str
     factor: float
@@ -41,8 +42,8 @@ _PAGE: ContextVar[Scale | None] = ContextVar("unit of a page", default=None)
 
 
 @contextmanager
-def one_unit(scale: Scale) -> Iterator[None]:
-    """Show all errors in one unit meanwhile, so that those of one page can be compared."""
+def one_unit(scale: Scale | None) -> Iterator[None]:
+    """Show all errors in one unit meanwhile, each in a handy one without a scale."""
     before = _PAGE.set(scale)
     try:
         yield
@@ -77,18 +78,23 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
 def prefixed_scale(largest: float, unit: str) -> Scale:
     """Return a unit with the prefix that makes `largest` a handy number; compounds have none."""
     if unit in _PREFIXED and largest > 0:
-        result = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
-        return Scale(result[0] + unit, 1.0 / result[1])
+        prefix = next((p for p in _PREFIXES if largest >= 0.5 * p[1]), _PREFIXES[-1])
+        return Scale(prefix[0] + unit, 1.0 / prefix[1])
     return Scale("" if unit == "1" else unit, 1.0)
 
 
+def any_scale(largest: float, unit: str) -> Scale:
+    """Return the unit in which a quantity of size `largest` in an SI unit is a handy number."""
+    return handy_scale(largest) if unit == "m" else prefixed_scale(largest, unit or "1")
+
+
 def in_brackets(what: str, unit: str) -> str:
-    """Return what an axis says: the quantity with its unit in brackets, if it has one."""
+    """Return the label of an axis: the quantity with its unit in brackets, if it has one."""
     return f"{what} [{unit}]" if unit not in ("", "1") else what
 
 
 def number(value: float, digits: int = 3, *, trim: bool = False) -> str:
-    """Return a number with so many significant digits, with an exponent only where it helps.
+    """Return a number with a count of significant digits, with an exponent only where it helps.
 
     With `trim` it ends in no zeros behind its point.
     """
@@ -133,7 +139,7 @@ _LABEL = 10
 
 
 def labelled(rows: Iterable[tuple[str, str]], width: int) -> str:
-    """Return texts beside their labels, in lines of the given width."""
+    """Return texts behind their labels, in lines of this width."""
     return "\n".join(
         # a percent sign stays with its number
         textwrap.fill(
@@ -149,12 +155,12 @@ def labelled(rows: Iterable[tuple[str, str]], width: int) -> str:
 
 
 def raised(text: str) -> str:
-    """Return a text that begins with a capital."""
+    """Return a text with a capital at its start."""
     return f"{text[:1].upper()}{text[1:]}"
 
 
 def lowered(text: str) -> str:
-    """Return a text that begins without a capital."""
+    """Return a text with a small letter at its start."""
     return f"{text[:1].lower()}{text[1:]}"
 
 
@@ -174,15 +180,15 @@ _LIKELIHOOD = (
 
 def confidence_text(confidence: float) -> str:
     """Return how sure a cause is, as a number and in words."""
-    displayed = round(confidence, 2)
-    words = next((w for least, w in _LIKELIHOOD if displayed >= least), "unlikely")
+    rounded = round(confidence, 2)
+    words = next((w for least, w in _LIKELIHOOD if rounded >= least), "unlikely")
     return f"confidence {percent(confidence)}: {words}"
 
 
 def share_text(candidate: Candidate, d: Diagnosis) -> str:
     """Return the share of the excess that an effect explains alone, or that it was only screened.
 
-    Of one of several named causes also what it removes beside the others.
+    Of one of several named causes also what it removes together with the others.
     """
     if not candidate.fitted and candidate.explained_share == 0:
         alone = "screened"
@@ -191,13 +197,10 @@ def share_text(candidate: Candidate, d: Diagnosis) -> str:
     else:
         screened = "" if candidate.fitted else " (screened)"
         alone = f"{percent(candidate.explained_share)}{screened}"
-    if len(d.causes) < 2:
+    if len(d.causes) < 2 or candidate.effect not in {c.effect for c in d.causes}:
         return alone
-    named = {c.effect for c in d.causes}
-    item = next(
-        (c for c in d.budget.causes if c.what == candidate.effect and c.what in named), None
-    )
-    return alone if item is None else f"{alone}; with others {item.percents[0]} %"
+    share = next((c for c in d.budget.causes if c.what == candidate.effect), None)
+    return alone if share is None else f"{alone}; with others {share.percents[0]} %"
 
 
 def rest_sentence(d: Diagnosis) -> str:
@@ -226,6 +229,11 @@ def listing(
     return f"{f'{between} '.join(words[:-1])}{'' if joint[0] == ';' else ' '}{joint} {words[-1]}"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as "2 records"."""
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
 def are(names: Sequence[str], between: str = ", ") -> str:
     """Return names with "is" or "are" behind them."""
     return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
@@ -247,14 +255,15 @@ def with_its_unit(value: float, unit: str) -> str:
     return with_unit(number(scale.factor * value), scale.unit or "1")
 
 
-def shown_in(model: Model, name: str) -> tuple[str, str]:
-    """Return the SI unit of a parameter and the unit it is shown in."""
+def in_display_unit(model: Model, name: str, *values: float) -> tuple[str, list[float]]:
+    """Return the display unit of a parameter, and SI values in it."""
     parameter = model.parameter(name)
-    return parameter.unit, parameter.display_unit or parameter.unit
+    unit = parameter.display_unit or parameter.unit
+    return unit, [convert(v, parameter.unit, unit) for v in values]
 
 
 def interval_text(low: float, high: float) -> str:
-    """Return an interval; one over more than four decades says that nothing was determined."""
+    """Return an interval; one over more than four decades counts as not determined."""
     if not (math.isfinite(low) and math.isfinite(high)) or (low > 0 and high > 1e4 * low):
         return "not determined"
     digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)

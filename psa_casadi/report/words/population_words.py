@@ -25,7 +25,7 @@ from psa_casadi.units import convert
 
 #: The output of a stack.
 _LENGTH = "displacement"
-#: So many names stand in a sentence; the table has all.
+#: Names in a sentence, at most; the table has all.
 _MOST_NAMED = 6
 METHOD = (
     "Every estimate comes with the interval of its own fit. The spread tau of the devices is what"
@@ -39,8 +39,8 @@ METHOD = (
 )
 
 
-class _Shown:
-    """A parameter's estimates as text, in the unit that the parameter is shown in."""
+class _ParameterText:
+    """A parameter's estimates as text, in the display unit of the parameter."""
 
     def __init__(self, e: population.Estimates) -> None:
         self.e, self.name, self.unit = e, e.name, population.display_unit(e.name, e.unit)
@@ -80,10 +80,8 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
     """Return the main findings, a sentence each."""
     devices = list(dict.fromkeys(o.device for o in p.outliers))
     if devices:
-        named = listing(devices[:_MOST_NAMED])
-        more = f" and {len(devices) - _MOST_NAMED} more" if len(devices) > _MOST_NAMED else ""
-        verb = "stands" if len(devices) == 1 else "stand"
-        first = f"{len(devices)} of {len(p.findings)} devices {verb} out: {named}{more}."
+        verb, named = "stands" if len(devices) == 1 else "stand", listing(devices, most=_MOST_NAMED)
+        first = f"{len(devices)} of {len(p.findings)} devices {verb} out: {named}."
     else:
         first = f"None of {len(p.findings)} devices stands out beyond noise and spread."
     sentences = [first]
@@ -99,11 +97,9 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
             if p.drifting
             else "No parameter drifts over the date beyond noise and spread."
         )
-    if p.causes:
-        c = p.causes[0]
-        sentences.append(
-            f"The most frequent cause is {plain(c.what)}: {c.count} of {c.of} devices."
-        )
+    for c in p.causes[:1]:
+        cause = f"The most frequent cause is {plain(c.what)}"
+        sentences.append(f"{cause}: {c.count} of {c.of} devices.")
     return (*sentences, *missed_sentences(p.findings))
 
 
@@ -121,7 +117,7 @@ def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
 
 
 def population_tables(p: population.Population) -> dict[str, Table]:
-    """Return who stands out, every parameter over the devices, batches, drift, and how often what.
+    """Return the tables of outliers, parameters, batches, drifts, verdicts and causes.
 
     That is: value, what the others predict, z and adjusted p; mean and spread; the means of batches
     that differ; the change over a year; verdicts and causes with Wilson's interval of their share.
@@ -131,46 +127,29 @@ def population_tables(p: population.Population) -> dict[str, Table]:
     outliers, rows, batches, drifts = [], [], [], []
     for o in p.outliers:
         s, place = spreads[o.parameter], devices[o.device]
-        result, displayed = p.findings[place], _Shown(s.estimates)
+        finding, text = p.findings[place], _ParameterText(s.estimates)
         mean, half = float(s.common.b[0]), NORMAL_95 * s.common.tau
         theta = float(s.estimates.theta[s.estimates.places.index(place)])
         outliers.append(
-            (o.device, result.batch, result.day.isoformat() if result.day else "", o.parameter,
-             displayed.value(theta), displayed.interval((mean - half, mean + half)), number(o.z, 3),
+            (o.device, finding.batch, finding.day.isoformat() if finding.day else "", o.parameter,
+             text.value(theta), text.interval((mean - half, mean + half)), number(o.z, 3),
              _p(o.p_adjusted))
         )  # fmt: skip
     for name, s in spreads.items():
-        c, displayed = s.common, _Shown(s.estimates)
-        rows.append(
-            (
-                name,
-                str(len(s.estimates.places)),
-                displayed.value(float(c.b[0])),
-                displayed.interval(c.interval()),
-                displayed.spread(c.tau),
-                displayed.spreads(c.tau_interval),
-                _p(c.p_value),
-                str(sum(o.parameter == name for o in p.outliers)),
-                _p(p.batch_p.get(name)),
-                _p(p.drift_p.get(name)),
-            )
-        )
+        common, text = s.common, _ParameterText(s.estimates)
+        centre = text.value(float(common.b[0])), text.interval(common.interval())
+        spread = text.spread(common.tau), text.spreads(common.tau_interval), _p(common.p_value)
+        count, outside = len(s.estimates.places), sum(o.parameter == name for o in p.outliers)
+        tests = _p(p.batch_p.get(name)), _p(p.drift_p.get(name))
+        rows.append((name, str(count), *centre, *spread, str(outside), *tests))
         if s.batches is not None and name in p.batches_differ:
-            batches += [
-                (
-                    name,
-                    b.name,
-                    str(b.devices),
-                    displayed.value(b.mean),
-                    displayed.interval(b.interval),
-                    displayed.spread(b.differs_by),
-                    _p(b.p_adjusted),
-                )
-                for b in s.batches.batches
-            ]
+            for b in s.batches.batches:
+                centre = text.value(b.mean), text.interval(b.interval)
+                differs = text.spread(b.differs_by), _p(b.p_adjusted)
+                batches.append((name, b.name, str(b.devices), *centre, *differs))
         if s.drift is not None and name in p.drifting:
-            slope = displayed.spread(s.drift.slope)
-            drifts.append((name, slope, displayed.spreads(s.drift.interval), _p(p.drift_p[name])))
+            slope = text.spread(s.drift.slope)
+            drifts.append((name, slope, text.spreads(s.drift.interval), _p(p.drift_p[name])))
     return {
         "outliers": Table(
             ("device", "batch", "date", "parameter", "value", "the others (95 %)", "z",
@@ -199,17 +178,14 @@ def _counts(what: str, rows: Sequence[population.Frequency]) -> Table:
 
 
 def left_out_sentence(p: population.Population) -> str:
-    """Say which parameters too few devices tell, "" where there are none."""
+    """Name the parameters that too few devices determine, "" where there are none."""
     if not p.left_out:
         return ""
-    return f"Told by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
+    return f"Determined by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
 
 
-def difference_sentence(
-    findings: Sequence[Finding], differences: Sequence[population.Difference] | None = None
-) -> str:
+def difference_sentence(findings: Sequence[Finding], rows: Sequence[population.Difference]) -> str:
     """Say which parameters differ beyond noise, how the verdicts do, and which fits miss."""
-    rows = population.differences(findings) if differences is None else differences
     differing = [d.estimates.name for d in rows if d.differs]
     if not rows:
         sentence = "The files share no parameter that two devices determine."
@@ -223,8 +199,8 @@ def difference_sentence(
     else:
         sentence = f"None of the {len(rows)} parameters differs beyond noise."
     if len({f.verdict for f in findings if f.verdict}) > 1:
-        items = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
-        sentence += f" Verdicts differ ({listing(items)})."
+        named = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
+        sentence += f" Verdicts differ ({listing(named)})."
     return " ".join((sentence, *missed_sentences(findings)))
 
 
@@ -243,18 +219,18 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
         ("cause (confidence)", *(causes_text(f) for f in findings)),
     ]
     for output in dict.fromkeys(e.output for f in findings for e in f.errors):
-        items = [next((e for e in f.errors if e.output == output), None) for f in findings]
-        report = [e for e in items if e is not None]
-        item, name = scale, ""
+        errors = [next((e for e in f.errors if e.output == output), None) for f in findings]
+        known = [e for e in errors if e is not None]
+        unit, name = scale, ""
         if output != _LENGTH:
-            item, name = prefixed_scale(max(e.base for e in report), report[0].unit), f"{output}, "
+            unit, name = prefixed_scale(max(e.base for e in known), known[0].unit), f"{output}, "
         for head, part in (
             (f"{name}base, held out", "base"),
             (f"{name}extended, held out", "extended"),
             (f"{name}noise", "noise"),
         ):
-            cells = ("" if e is None else number(item.factor * getattr(e, part)) for e in items)
-            columns.append((in_brackets(head, item.unit), *cells))
+            cells = ("" if e is None else number(unit.factor * getattr(e, part)) for e in errors)
+            columns.append((in_brackets(head, unit.unit), *cells))
     fitted = ("" if f.rms_m is None else number(scale.factor * f.rms_m) for f in findings)
     columns.append((f"fitted, rms [{scale.unit}]", *fitted))
     shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
@@ -267,8 +243,8 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
 
 def causes_text(f: Finding) -> str:
     """Return the named causes with their confidence, rivals joined by "or"."""
-    items = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
-    return listing(items)
+    texts = [f"{either((c.effect, *c.or_else))} ({percent(c.confidence)})" for c in f.causes]
+    return listing(texts)
 
 
 def budget_table(findings: Sequence[Finding]) -> Table:
@@ -286,16 +262,16 @@ def difference_table(findings: Sequence[Finding], rows: Sequence[population.Diff
     """Return the shared parameters with intervals, one device a column, and whether they differ."""
     body = []
     for d in rows:
-        displayed, cells = _Shown(d.estimates), []
+        text, cells = _ParameterText(d.estimates), []
         for k, f in enumerate(findings):
-            p = f.parameters.get(displayed.name)
+            p = f.parameters.get(text.name)
             if p is None or k not in d.estimates.places:
                 cells.append("not determined")
                 continue
-            low, high = map(displayed.number, p.interval or (p.value, p.value))
-            cells.append(f"{displayed.number(p.value)} ({low} to {high})")
+            low, high = map(text.number, p.interval or (p.value, p.value))
+            cells.append(f"{text.number(p.value)} ({low} to {high})")
         differ = "yes" if d.differs else "within noise"
-        body.append((displayed.name, displayed.unit, *cells, _p(d.p_adjusted), differ))
+        body.append((text.name, text.unit, *cells, _p(d.p_adjusted), differ))
     head = ("parameter", "unit", *(f.device for f in findings), "p, adjusted", "differ")
     return Table(head, tuple(body))
 

@@ -17,6 +17,7 @@ from psa_casadi.report.words.phrases import (
     Scale,
     added,
     handy_scale,
+    in_display_unit,
     interval_text,
     listing,
     lowered,
@@ -26,16 +27,14 @@ from psa_casadi.report.words.phrases import (
     prefixed_scale,
     raised,
     scale_of,
-    shown_in,
     with_its_unit,
     with_unit,
 )
 from psa_casadi.report.words.verdict_words import within
-from psa_casadi.units import convert
 
 _FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"
 
-#: What can be done. Those below the line are the kinds of effects of a model of one's own.
+#: What can be done. Those below the comment are the kinds of effects of any other model.
 DO: Mapping[str, str] = {
     "extended_model": "Use the extended model in the place of the base",
     "wait_or_feed_forward": (
@@ -88,7 +87,7 @@ DO: Mapping[str, str] = {
         "Keep the temperature steady, start when the set-up has warmed up, or record the"
         " temperature and correct by it"
     ),
-    # a model of one's own
+    # any model but a stack
     "lag": "Drive slower, use a faster device there, or keep the lag in the model",
     "delay": "Shift the time of that signal, sample by one clock, or keep the delay in the model",
     "bend": "Calibrate that signal and correct it by the curve, or keep the curve in the model",
@@ -154,14 +153,14 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
         where = listing([number(s.at) for s in sizes])
         text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
     else:
-        table = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
+        amounts = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
         still = {s.output for s in sizes if s.value == 0.0} if len(sizes) > 1 else set()
         moves = [
             f"the {plain(o)} by up to {a}"
-            for (test, o), a in table.items()
+            for (test, o), a in amounts.items()
             if test == "record" and o not in still
         ]
-        rms = "".join(f", {a} rms" for (test, _), a in table.items() if test == "rms")
+        rms = "".join(f", {a} rms" for (test, _), a in amounts.items() if test == "rms")
         text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
     return text
 
@@ -179,7 +178,7 @@ def _amount(size: Size, length: Scale) -> str:
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
 _FILES = ("model.json", "extended.json")
-#: Causes whose remedies are told, and rivals of each.
+#: Causes with a remedy, and rivals of each.
 _CAUSES, _RIVALS = 3, 2
 
 
@@ -188,7 +187,7 @@ class Advice:
     """What to do: a sentence for every cause, what else counts, and commands to type."""
 
     causes: tuple[str, ...]
-    beside: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
 
 
@@ -201,17 +200,17 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
         ))  # fmt: skip
     stack = d if isinstance(d, StackDiagnosis) else None
     errors, noise = _sizes(d)
-    commands, others = _commands(d, model_file)
+    commands, remarks = _commands(d, model_file)
     if d.verdict == "adequate" and d.doubt:
         text = "Use the model within these records only: their held-out samples cannot confirm it."
-        return Advice((text,), others, commands[:1])
+        return Advice((text,), remarks, commands[:1])
     if d.verdict == "adequate":
         text = (
-            f"Use the model: it errs by {errors} on samples that no fit has seen, at a noise of"
+            f"Use the model: it errs by {errors} on held-out samples, at a noise of"
             f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
             " are untested."
         )
-        return Advice((text,), others, commands)
+        return Advice((text,), remarks, commands)
     if not d.causes:
         text = (
             f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
@@ -223,13 +222,13 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
                 f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
                 " above the noise."
             )
-            others = (patched, *others)
-        return Advice((text,), others, commands)
+            remarks = (patched, *remarks)
+        return Advice((text,), remarks, commands)
     if d.verdict == "partly_explained" and isinstance(d.budget, StackBudget):
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
-        others = (f"Without an explanation stays {left} rms above the noise.", *others)
+        remarks = (f"Without an explanation stays {left} rms above the noise.", *remarks)
     lines = tuple(_of_cause(c, lambda v: scale_of(d.experiments, v)) for c in d.causes[:_CAUSES])
-    return Advice(lines, (*_rivals(d.causes), *others), commands)
+    return Advice(lines, (*_rivals(d.causes), *remarks), commands)
 
 
 def _sizes(d: Diagnosis) -> tuple[str, str]:
@@ -253,10 +252,10 @@ def _further(d: Diagnosis) -> str:
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the commands that take the model further, and what must be said of its file."""
+    """Return the commands that take the model further, and remarks on its file."""
     stack = d if isinstance(d, StackDiagnosis) else None
     if not (stack or model_file or added(d)):
-        return (), ()  # what there is of one's own is its equations
+        return (), ()  # its equations are already there
     file = model_file or _FILES[added(d)]
     if d.model.structure.foreign:
         around = d.causes and all(c.belongs_to in ("drive", "sensor") for c in d.causes)
@@ -277,16 +276,16 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
         commands.append(
             f"psa design experiment {model} --record RECORD.csv --separate {names} -o NEXT.csv"
         )
-    items = []
+    remarks = []
     if outside:
         names = listing([plain(c.effect) for c in outside])
-        items.append(f"An exported plant leaves out {names}: correct the reading instead.")
+        remarks.append(f"An exported plant leaves out {names}: correct the reading instead.")
     if model_file is None:
-        items.append(
+        remarks.append(
             f"The commands read {file}: write it with -o {file}, in Python with"
             f' psa.save_model(result.model, "{file}").'
         )
-    return tuple(commands), tuple(items)
+    return tuple(commands), tuple(remarks)
 
 
 def _of_cause(cause: Cause, length: Length) -> str:
@@ -303,8 +302,8 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
         known = [EFFECTS[n] for n in cause.cannot_be_told_from[:_RIVALS] if n in EFFECTS]
         each = [f"{plain(e.name)}: {lowered(DO[e.what_now.code])}" for e in known]
         if each:
-            item = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
-            tests = dict.fromkeys(e.what_now.test for e in (*item, *known))
+            cause_effect = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
+            tests = dict.fromkeys(e.what_now.test for e in (*cause_effect, *known))
             text = listing([RECORDS[t] for t in tests])
             lines.append(
                 f"The record does not decide; in the place of {plain(cause.effect)} it may be"
@@ -318,8 +317,8 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
 def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:
     """Return how large an effect of a model is, with the size of its gain."""
     name = effect.gain or ""
-    unit, display = shown_in(model, name)
-    gain = with_unit(number(convert(model.values[name], unit, display), 2), display)
+    unit, (value,) = in_display_unit(model, name, model.values[name])
+    gain = with_unit(number(value, 2), unit)
     size = size_text(sizes, handy_scale) or "it changes too little to be seen in its test"
     stack = next((n for n in STACKS if re.sub(r"\W", "_", n) == model.name), "this model")
     return f"on {stack} with {name} = {gain}: {size}"

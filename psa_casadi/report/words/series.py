@@ -12,7 +12,6 @@ from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
-from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
@@ -32,10 +31,10 @@ class Curve:
 class Series:
     """One record with the curves to compare, arrays of shape (n,) in SI units, nan where missing.
 
-    `noise` is the standard deviation of the record's noise [m]; `counts` says that lengths are in
+    `noise` is the standard deviation of the record's noise [m]; with `counts` lengths are in
     counts of the sensor. Of a model that is no stack, `measured` is another `quantity` in its
-    `unit`, and `voltage` what it is shown `against`, "" if there is nothing. `place` numbers its
-    experiment and channel.
+    `unit`, and `voltage` the quantity that it is plotted `against`, "" for none. `place` numbers
+    its experiment and channel.
     """
 
     name: str
@@ -90,12 +89,12 @@ class Series:
 
     @property
     def label(self) -> str:
-        """What an axis of the measured quantity says."""
+        """The label of the axis of the measured quantity."""
         return phrases.in_brackets(self.quantity, self.scale.unit)
 
     @property
     def time_scale(self) -> phrases.Scale:
-        """The unit to show times in: `shown = factor * seconds`."""
+        """The unit to show times in: `number = factor * seconds`."""
         return time_scale(float(self.time[-1] - self.time[0]))
 
     @property
@@ -108,7 +107,7 @@ class Series:
 
 
 def time_scale(span: float) -> phrases.Scale:
-    """Return the unit to show times of a span [s] in: `shown = factor * seconds`."""
+    """Return the unit to show times of a span [s] in: `number = factor * seconds`."""
     if span >= 1.0:
         return phrases.Scale("s", 1.0)
     return phrases.Scale("ms", 1e3) if span >= 1e-3 else phrases.Scale("µs", 1e6)
@@ -126,7 +125,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     stack = d if isinstance(d, StackDiagnosis) else None
     count = 1 if stack else len(d.experiments[0].channels)
     noise = {e.output: e.noise for e in d.errors}
-    items = []
+    rows = []
     for j in range(count):
         base, extended = d.shown(j)
         for k, e in enumerate(d.experiments):
@@ -135,10 +134,10 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
                 curves.append(Curve("extended model", colours.EXTENDED, extended[k]))
             if stack:
                 level = stack.noise[k].level if stack.noise else stack.noise_floor_rms_m
-                items.append(_displacement(k, e, curves, level))
+                rows.append(_displacement(k, e, curves, level))
             else:
-                items += _output(d.model, d.experiments, (k, j), noise, curves)
-    return tuple(items)
+                rows += _output(d, (k, j), noise, curves)
+    return tuple(rows)
 
 
 def series_of_fit(identification: Identification) -> tuple[Series, ...]:
@@ -160,13 +159,7 @@ def series_of_fit(identification: Identification) -> tuple[Series, ...]:
         place = identification.model.output_names.index(channel.column)
         for k, y in enumerate(outputs):
             curves = [Curve("model", colours.EXTENDED, y[:, place])]
-            rows += _output(
-                identification.model,
-                identification.experiments,
-                (k, j),
-                identification.noise,
-                curves,
-            )
+            rows += _output(identification, (k, j), identification.noise, curves)
     return tuple(rows)
 
 
@@ -185,19 +178,18 @@ def _displacement(k: int, e: Experiment, curves: Sequence[Curve], noise: float) 
 
 
 def _output(
-    model: Model,
-    experiments: Sequence[Experiment],
+    result: Diagnosis | Identification,
     place: tuple[int, int],
     noise: Mapping[str, float],
     curves: Sequence[Curve],
 ) -> Iterator[Series]:
     """Yield the series of a record and a channel, by their `place`, if it has readings enough."""
     k, j = place
-    e, channel = experiments[k], experiments[0].channels[j]
+    e, channel = result.experiments[k], result.experiments[0].channels[j]
     if channel.column not in noise or np.isfinite(e.measured(j)).sum() < _FEWEST:
         return
-    record, name, moving = e.record, channel.column, varied(model, e)
-    units = {i.name: i.unit for i in model.structure.inputs}
+    record, name, moving = e.record, channel.column, varied(result.model, e)
+    units = {i.name: i.unit for i in result.model.structure.inputs}
     along = None if moving is None else record.column(moving)
     yield Series(
         name=record.name if len(noise) == 1 else f"{name} of {record.name}",
@@ -206,7 +198,7 @@ def _output(
         measured=e.measured(j),
         curves=tuple(curves),
         held_out=e.at(j, e.held_out),
-        noise=noise[name] * e.share(j) / noise_share(experiments, j),
+        noise=noise[name] * e.share(j) / noise_share(result.experiments, j),
         counts=False,
         quantity=name,
         unit=channel.unit or "1",
@@ -257,8 +249,8 @@ def telling_window(s: Series) -> slice:
                 continue
             y = first.values[part]
             errors = [float(np.sqrt(np.mean(m[part] ** 2))) for m in miss]
-            observed = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
-            score = observed / (float(np.ptp(y)) + 6.0 * s.noise + observed) * width**0.25
+            fall = max(errors[0] - (errors[-1] if len(errors) > 1 else s.noise), 0.0)
+            score = fall / (float(np.ptp(y)) + 6.0 * s.noise + fall) * width**0.25
             if score > best:
                 best, window = score, part
     return window

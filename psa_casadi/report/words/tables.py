@@ -20,6 +20,7 @@ from psa_casadi.report.words.phrases import (
     Scale,
     added,
     in_brackets,
+    in_display_unit,
     interval_text,
     number,
     percent,
@@ -27,12 +28,10 @@ from psa_casadi.report.words.phrases import (
     prefixed_scale,
     probability_text,
     share_text,
-    shown_in,
     with_unit,
 )
 from psa_casadi.report.words.series import ResidualFigures, Series
 from psa_casadi.simulation.timings import Stage
-from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
@@ -52,8 +51,8 @@ class Table:
     def fitted(self, width: float = math.inf) -> str:
         """Return the table in columns of plain text whose lines have `width` characters at most.
 
-        Cells go on in further lines where their column is narrower. `laid_out` says which way the
-        table lies.
+        Cells go on in further lines where their column is narrower. `laid_out` decides which way
+        the table lies.
         """
         return self.laid_out(width)._lines(width)
 
@@ -110,22 +109,17 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 def parameter_table(
     model: Model, identification: Identification | None = None, only: Collection[str] | None = None
 ) -> Table:
-    """Return every parameter with value, 95 % interval, unit, how it was found, and meaning.
+    """Return every parameter with value, 95 % interval, unit, source, and meaning.
 
-    Those named in `only`, where that is given.
+    With `only` those that it names.
     """
     rows = []
     for p in (p for p in model.structure.parameters if only is None or p.name in only):
-        unit, display = shown_in(model, p.name)
         interval = model.provenance.intervals.get(p.name)
-        text = ""
-        if interval is not None:
-            low, high = (convert(v, unit, display) for v in (interval.low, interval.high))
-            text = interval_text(low, high)
-        value = number(convert(model.values[p.name], unit, display), 4)
-        rows.append(
-            (p.name, value, text, display, _status(model, p.name, identification), p.description)
-        )
+        known = (interval.low, interval.high) if interval else ()
+        unit, (value, *ends) = in_display_unit(model, p.name, model.values[p.name], *known)
+        text, status = interval_text(*ends) if ends else "", _status(model, p.name, identification)
+        rows.append((p.name, number(value, 4), text, unit, status, p.description))
     return _table(("parameter", "value", "95 % interval", "unit", "found by", "meaning"), rows)
 
 
@@ -150,9 +144,9 @@ def candidate_table(d: Diagnosis) -> Table:
 
 
 def error_table(d: Diagnosis, scale: Scale) -> Table:
-    """Return the errors of base and extended model beside the noise.
+    """Return the errors of base and extended model, and the noise.
 
-    Of a stack they are lengths in the unit of the scale, else those of every output in its own.
+    Of a stack they are lengths in the unit of the scale, else those of every output in its unit.
     """
     if not isinstance(d, StackDiagnosis):
         rows = [(e.output, e.unit, e.noise, e.base, e.extended) for e in d.errors]
@@ -162,8 +156,8 @@ def error_table(d: Diagnosis, scale: Scale) -> Table:
     models = [("base", d.base_errors), ("extended", d.extended_errors)]
     for name, e in models if added(d) else models[:1]:
         lengths = (e.train_rms_m, e.holdout_rms_m, e.holdout_max_m)
-        displayed = (number(factor * v) for v in lengths)
-        lines.append((name, *displayed, number(e.holdout_nrmse_percent)))
+        figures = (number(factor * v) for v in lengths)
+        lines.append((name, *figures, number(e.holdout_nrmse_percent)))
     noise = number(factor * d.noise_floor_rms_m)
     lines.append(("noise", noise, noise, "", ""))
     head = (f"training rms [{unit}]", f"held-out rms [{unit}]", f"held-out largest [{unit}]")
@@ -190,25 +184,25 @@ def _falls(
     rows = []
     for name, unit, noise, base, after in inputs:
         scale = prefixed_scale(base, unit)
-        items = [noise, base, *([after] if extended else [])]
+        figures = [noise, base, *([after] if extended else [])]
         falls = [f"{100.0 * (1.0 - after / base):.0f} %"] if extended and base > 0 else []
-        rows.append((name, scale.unit, *(number(scale.factor * v) for v in items), *falls))
+        rows.append((name, scale.unit, *(number(scale.factor * v) for v in figures), *falls))
     return _table((*head, *(("extended, held-out rms", "falls by") if extended else ())), rows)
 
 
 def column_table(d: StackDiagnosis) -> Table:
-    """Return what base and extended model miss of every further column, beside its noise."""
+    """Return what base and extended model miss of every further column, and its noise."""
     rows = []
     for c in d.columns:
         errors = (c.noise, c.base_rms, c.extended_rms if added(d) else None)
-        displayed = ("" if e is None else number(e) for e in errors)
-        rows.append((c.column, c.role, c.unit, *displayed))
+        figures = ("" if e is None else number(e) for e in errors)
+        rows.append((c.column, c.role, c.unit, *figures))
     head = ("noise rms", "base, held-out rms", "extended, held-out rms")
     return _table(("column", "used as", "unit", *head), rows)
 
 
 def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]) -> Table:
-    """Return what the model leaves of every record, beside the record's noise level.
+    """Return what the model leaves of every record, and the record's noise level.
 
     Each quantity has its unit, that of its largest error.
     """
@@ -219,13 +213,13 @@ def fit_error_table(series: Sequence[Series], figures: Sequence[ResidualFigures]
     lines = []
     for s, f in zip(series, figures, strict=True):
         scale = scales[s.quantity]
-        displayed = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
+        sizes = (number(scale.factor * v) for v in (f.rms, f.largest, f.noise))
         ratio = number(f.rms / f.noise, 2) if f.noise > 0 else ""
-        output = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
-        lines.append((s.name, *(() if one else (scale.unit,)), *displayed, *output))
+        others = (ratio, number(100.0 * f.range_share, 2), number(f.neighbours, 2))
+        lines.append((s.name, *(() if one else (scale.unit,)), *sizes, *others))
     lengths = [in_brackets(what, one) for what in ("rms", "largest", "noise")]
-    output = ("rms / noise", "rms [% of range]", "correlation of neighbours")
-    return _table(("record", *(() if one else ("unit",)), *lengths, *output), lines)
+    others = ("rms / noise", "rms [% of range]", "correlation of neighbours")
+    return _table(("record", *(() if one else ("unit",)), *lengths, *others), lines)
 
 
 def starts_table(starts: Iterable[StartOutcome], scale: Scale) -> Table:
@@ -241,9 +235,9 @@ def record_table(experiments: "Sequence[Experiment]", origin: str) -> Table:
     """Return the records with their size, how they were used, and their SHA-256."""
     rows = []
     for e in experiments:
-        inputs = e.record
+        record = e.record
         counts = (str(int(part.sum())) for part in (e.used, e.held_out))
-        rows.append((inputs.name, origin, number(inputs.duration), *counts, inputs.sha256))
+        rows.append((record.name, origin, number(record.duration), *counts, record.sha256))
     return _table(
         ("record", "origin", "duration [s]", "samples fitted", "samples held out", "SHA-256"), rows
     )
@@ -268,8 +262,8 @@ def blind_table(d: StackDiagnosis) -> Table:
     rows = []
     for b in blindest(d):
         # a screening without any direction for the effect reports the largest number there is
-        observed = b.smallest_detectable_gain < 1e100
-        size = with_unit(number(b.smallest_detectable_gain), b.unit) if observed else "at no size"
+        detectable = b.smallest_detectable_gain < 1e100
+        size = with_unit(number(b.smallest_detectable_gain), b.unit) if detectable else "at no size"
         rows.append((plain(b.effect), size, b.why))
     return _table(("effect", "shows from", "why"), rows)
 
@@ -277,7 +271,7 @@ def blind_table(d: StackDiagnosis) -> Table:
 def effects_table(effects: Iterable[Component]) -> Table:
     """Return the effects with where they belong and what an engineer sees."""
     rows = [(e.name, e.belongs_to, e.description, e.looks_like) for e in effects]
-    return _table(("effect", "belongs to", "what it is", "what it looks like"), rows)
+    return _table(("effect", "belongs to", "what it is", "expected signature"), rows)
 
 
 def effect_parameter_table(effect: Component) -> Table:
@@ -304,10 +298,10 @@ def stack_table(stack: Stack) -> Table:
     model = stack_model(stack.name)
     rows = []
     for name in model.parameter_names:
-        unit, display = shown_in(model, name)
         figure = stack.values[name]
-        value = number(convert(figure.value, unit, display), 6)
-        rows.append((name, value, display, "assumed" if figure.assumed else "", figure.source))
+        unit, (value,) = in_display_unit(model, name, figure.value)
+        assumed = "assumed" if figure.assumed else ""
+        rows.append((name, number(value, 6), unit, assumed, figure.source))
     return _table(("parameter", "value", "unit", "", "source"), rows)
 
 
@@ -317,9 +311,9 @@ def check_table(report: "CheckReport") -> Table:
     for r in report.rows:
         # where none is allowed it counts problems
         counted = r.limit == 0 and r.figure >= 0
-        matches = str(int(r.figure)) if counted else number(r.figure)
+        figure = str(int(r.figure)) if counted else number(r.figure)
         result = "note" if r.noted else "pass" if r.passed else "FAIL"
-        rows.append((r.name, matches, number(r.limit), result, r.remark, r.clause))
+        rows.append((r.name, figure, number(r.limit), result, r.remark, r.clause))
     head = ("check", "found", "allowed", "result", "remark", "clause")
     if report.foreign:
         return _table((*head[:1], *head[3:]), [(row[0], *row[3:]) for row in rows])
@@ -329,7 +323,7 @@ def check_table(report: "CheckReport") -> Table:
 def timings_table(stages: Sequence[Stage]) -> Table:
     """Return time, processor time of all threads with its share, and simulations of every stage.
 
-    Behind the simulations stands how many of them were with sensitivities.
+    The last column counts the simulations with sensitivities.
     """
     figures = ((s.wall, s.processor, s.runs, s.differentiated) for s in stages)
     total = Stage("total", *map(sum, zip(*figures, strict=True)))

@@ -23,6 +23,7 @@ from psa_casadi.report.words.phrases import (
     MOST_NAMES,
     Scale,
     added,
+    in_display_unit,
     labelled,
     listing,
     number,
@@ -33,12 +34,10 @@ from psa_casadi.report.words.phrases import (
     probability_text,
     rest_sentence,
     scale_of,
-    shown_in,
     with_its_unit,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
-from psa_casadi.units import convert
 
 if TYPE_CHECKING:
     from psa_casadi.export.check.check import CheckReport
@@ -47,11 +46,7 @@ Lines = Sequence[tuple[str, str]]
 
 
 def story(
-    d: Diagnosis,
-    *,
-    origin: str = "measured",
-    width: int = 100,
-    model_file: str | None = None,
+    d: Diagnosis, *, origin: str = "measured", width: int = 100, model_file: str | None = None
 ) -> str:
     """Return a diagnosis in ten to twenty lines: verdict with gain, errors, cause, what now, rest.
 
@@ -60,7 +55,7 @@ def story(
     """
     if not isinstance(d, Diagnosis):
         raise InputError(
-            f"`story` tells a diagnosis, and this is of type {type(d).__name__}; print it."
+            f"`story` describes a diagnosis, and this is of type {type(d).__name__}; print it."
         )
     advice = what_now(d, model_file)
     now = [("what now", text) for text in advice.causes]
@@ -69,7 +64,7 @@ def story(
     return labelled([lines[0], *now, *lines[1:]], width)
 
 
-def told(d: Diagnosis) -> str:
+def diagnosis_text(d: Diagnosis) -> str:
     """Return how a diagnosis of any model prints: its verdict, and its story without advice."""
     return f"{d.verdict}\n{labelled(_lines(d, 'measured'), 100)}"
 
@@ -86,11 +81,8 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
-        lines += (
-            [("kind", statement)]
-            if (statement := verdict_words.family_sentence(c.families))
-            else []
-        )
+        if kind := verdict_words.family_sentence(c.families):
+            lines.append(("kind", kind))
         lines.append(("rivals", _rivals(d, c)))
     if stack:
         columns = [verdict_words.column_sentence(stack, c) for c in stack.columns]
@@ -127,7 +119,7 @@ def _missed(e: OutputError, d: Diagnosis) -> str:
 
 
 def _rivals(d: Diagnosis, cause: Cause) -> str:
-    """Return what a cause cannot be told from, else the next most probable effect of the first."""
+    """Return the effects that the data cannot separate from a cause, else the next probable one."""
     known = {c.effect: c.probability for c in d.candidates}
     # the candidates are those of the first step, whose cause may be without a name
     steps = [c.what for c in d.budget.causes]
@@ -147,29 +139,23 @@ def _rivals(d: Diagnosis, cause: Cause) -> str:
 
 
 def identification_text(
-    stack_identification: StackIdentification, *, origin: str = "measured", width: int = 100
+    identification: StackIdentification, *, origin: str = "measured", width: int = 100
 ) -> str:
     """Return an identification: error, parameters with intervals, warnings, what is left open."""
-    scale = scale_of(stack_identification.experiments, stack_identification.fit.rms)
-    span = max(e.record.range_m for e in stack_identification.experiments)
-    share = number(100.0 * stack_identification.fit.rms / span, 2)
+    scale = scale_of(identification.experiments, identification.fit.rms)
+    span = max(e.record.range_m for e in identification.experiments)
+    share = number(100.0 * identification.fit.rms / span, 2)
     head = [
-        ("records", _records_text(stack_identification.experiments, origin)),
-        (
-            "error",
-            f"{scale.text(stack_identification.fit.rms)} rms, {share} % of the largest range",
-        ),
+        ("records", _records_text(identification.experiments, origin)),
+        ("error", f"{scale.text(identification.fit.rms)} rms, {share} % of the largest range"),
     ]
-    tail = [("warning", w) for w in stack_identification.warnings]
-    tail += [("open", c.sentence) for c in stack_identification.combinations]
-    tail += [("next", a.sentence) for a in stack_identification.advice]
+    tail = [("warning", w) for w in identification.warnings]
+    tail += [("open", c.sentence) for c in identification.combinations]
+    tail += [("next", a.sentence) for a in identification.advice]
     tail += [
-        ("note", n)
-        for n in (*stack_identification.sentences, *stack_identification.model.provenance.notes)
+        ("note", n) for n in (*identification.sentences, *identification.model.provenance.notes)
     ]
-    return _around(
-        head, parameter_table(stack_identification.model, stack_identification), tail, width
-    )
+    return _around(head, parameter_table(identification.model, identification), tail, width)
 
 
 def fit_sentence(identification: Identification) -> str:
@@ -184,11 +170,11 @@ def fit_sentence(identification: Identification) -> str:
 
 
 def effect_page(
-    effect: Component, width: int = 100, observed: tuple[Model, Sequence[Size]] | None = None
+    effect: Component, width: int = 100, example: tuple[Model, Sequence[Size]] | None = None
 ) -> str:
     """Return one effect: what it is, equation, signature, source, what now, parameters.
 
-    `observed` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
+    `example` is a model that holds it, and how large it is there (`diagnosis.remedy.example`).
     """
     lines = [
         ("what", effect.description),
@@ -197,7 +183,7 @@ def effect_page(
         ("signature", effect.looks_like),
         ("source", effect.source),
     ]
-    lines += [("how large", effect_size(effect, *observed))] if observed is not None else []
+    lines += [("how large", effect_size(effect, *example))] if example is not None else []
     lines += zip(("what now", "record"), effect_advice(effect), strict=True)
     return f"{effect.name}\n\n{_around(lines, effect_parameter_table(effect), (), width)}"
 
@@ -220,12 +206,12 @@ def check_sentence(report: "CheckReport") -> str:
 
 def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
     """Return the records with their samples, duration and what they are."""
-    parts, out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
-    for name, item in in_parts(e.record for e in experiments):
-        held, lasts = sum(out[id(r)] for r in item), sum(r.duration for r in item)
+    parts, held_out = [], {id(e.record): int(e.held_out.sum()) for e in experiments}
+    for name, records in in_parts(e.record for e in experiments):
+        held, lasts = sum(held_out[id(r)] for r in records), sum(r.duration for r in records)
         rest = f", {held} of them held out" if held else ""
-        cut = f"{len(item)} parts, " * (len(item) > 1)
-        size = f"{cut}{sum(r.n for r in item)} samples in {number(lasts)} s{rest}"
+        cut = f"{len(records)} parts, " * (len(records) > 1)
+        size = f"{cut}{sum(r.n for r in records)} samples in {number(lasts)} s{rest}"
         parts.append(f"{name} ({origin}: {size})")
     return "; ".join(parts)
 
@@ -243,13 +229,12 @@ def posterior_table(posterior: Posterior) -> Table:
     """Return every parameter with mean, sd, 94 % interval, effective draws and r-hat."""
     rows = []
     for f in posterior.figures:
-        unit, display = shown_in(posterior.model, f.name)
-        mean, low, high = (convert(x, unit, display) for x in (f.mean, f.low, f.high))
-        spread = convert(f.mean + f.sd, unit, display) - mean
+        values = (f.mean, f.low, f.high, f.mean + f.sd)
+        unit, (mean, low, high, upper) = in_display_unit(posterior.model, f.name, *values)
         interval = f"{number(low, 4)} to {number(high, 4)}"
-        output = (display, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
+        sampling = (unit, f"{f.ess:.0f}", f"{f.r_hat:.3f}")
         meaning = posterior.model.parameter(f.name).description
-        rows.append((f.name, number(mean, 4), number(spread), interval, *output, meaning))
+        rows.append((f.name, number(mean, 4), number(upper - mean), interval, *sampling, meaning))
     head = ("parameter", "mean", "sd", "94 % interval", "unit", "ess", "r-hat", "meaning")
     return Table(head, tuple(rows))
 

@@ -1,33 +1,33 @@
 """The verdict of a diagnosis and its error budget in sentences."""
 
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 
 from psa_casadi.diagnosis.corrections import Correction, Patch
 from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
-from psa_casadi.diagnosis.result import Alternative, Cause, Decision, Diagnosis, StackDiagnosis
+from psa_casadi.diagnosis.result import (
+    Alternative,
+    Cause,
+    Decision,
+    Diagnosis,
+    StackDiagnosis,
+    Verdict,
+)
 from psa_casadi.identification.start.doubts import doubtful_sign
 from psa_casadi.report.words import phrases
 from psa_casadi.report.words.tables import Table
-from psa_casadi.units import convert
 
-VERDICTS = {
-    "adequate": "adequate",
-    "cause_named": "cause named",
-    "partly_explained": "partly explained",
-    "ambiguous": "ambiguous",
-    "unexplained": "unexplained",
-    "not_driven": "not driven",
-}
+VERDICTS: dict[str, str] = {verdict: verdict.replace("_", " ") for verdict in get_args(Verdict)}
 
 
 #: Outputs that a sentence names one by one.
 _NAMED = 4
 #: A row of the budget.
 _REMAINS = "remains above the noise"
-#: What an interval of the gain from blocks of few records says.
+#: What an interval of the gain from blocks of few records means.
 OWN_VOLTAGES = (
     "The interval is taken over blocks of the held-out samples and holds for these voltages only;"
     " for other voltages hold out four records or more (--holdout)."
@@ -40,10 +40,10 @@ def gain_sentence(d: StackDiagnosis) -> str:
     low, high = d.gain.interval
     if gain <= 0:
         return "the held-out error does not fall"
-    output = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
-    if output[1] == "100":
-        output = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
-    return f"the held-out error falls by {output[0]} % (95 % interval {output[1]} to {output[2]} %)"
+    fall, least, most = (f"{gain:.0f}", f"{low:.0f}", f"{high:.0f}")
+    if least == "100":
+        fall, least, most = Share("error", 0.01 * gain, (0.01 * low, 0.01 * high)).percents
+    return f"the held-out error falls by {fall} % (95 % interval {least} to {most} %)"
 
 
 def verdict_sentence(d: Diagnosis) -> str:
@@ -55,13 +55,13 @@ def verdict_sentence(d: Diagnosis) -> str:
     elif d.verdict == "adequate":
         text = f"Nothing beyond the noise is missing from the base model; {_base_errors(d)}"
     elif d.verdict == "not_driven":
-        observed = (
+        reason = (
             "The displacement falls while the voltage rises: correct the sign of one of them."
             " Nothing was diagnosed"
             if doubtful_sign([e.record for e in d.experiments])
             else "The displacement does not follow the voltage: nothing can be diagnosed"
         )
-        text = f"{observed}; {_base_errors(d)}"
+        text = f"{reason}; {_base_errors(d)}"
     elif d.verdict == "unexplained" or not d.causes:
         nothing = "Something is missing, and no effect in the table explains it: no cause is named"
         text = f"{nothing}; {_without_name(d)}{_base_errors(d)}"
@@ -99,7 +99,7 @@ def _named(d: Diagnosis) -> str:
 def of_range(d: Diagnosis, *, extended: bool = False) -> dict[str, float]:
     """Return a model's held-out error in every output, in % of its range in all records.
 
-    That of a stack's displacement is each record's over its own range.
+    That of a stack's displacement is each record's over that record's range.
     """
     if isinstance(d, StackDiagnosis):
         errors = d.extended_errors if extended else d.base_errors
@@ -126,7 +126,7 @@ def _base_errors(d: Diagnosis) -> str:
 
 
 def within(share: float) -> float:
-    """Return a share as it is shown, from 0 to 1."""
+    """Return a share cut to 0 and 1."""
     return max(0.0, min(1.0, share))
 
 
@@ -150,15 +150,15 @@ def _without_name(d: Diagnosis) -> str:
 
 
 def named_cause(cause: Cause) -> str:
-    """Name a cause with its place, how sure it is, and what it cannot be told from."""
+    """Name a cause with its place, its confidence, and its indistinguishable rivals."""
     sure = f"{phrases.place_of(cause)}, {phrases.confidence_text(cause.confidence)}"
     if cause.cannot_be_told_from:
         sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
     return f"{phrases.plain(cause.effect)} ({sure})"
 
 
-#: Something that was not tried is told from this probability on.
-_TOLD = 0.005
+#: Least probability from which on a sentence mentions what was not tried.
+_LEAST_REST = 0.005
 #: What effects of a kind do, and the places of a rig.
 _DOES = {
     "curve": "a bent static curve",
@@ -193,12 +193,12 @@ def family_sentence(families: Sequence[Family]) -> str:
             part += ", none of the listed effects"
         parts.append(part)
     rest = 1.0 - sum(f.probability for f in families)
-    if families and rest >= _TOLD:
+    if families and rest >= _LEAST_REST:
         parts.append(f"something that was not tried ({phrases.percent(rest)})")
     return phrases.listing(parts, "or")
 
 
-def alternative_sentence(d: StackDiagnosis, a: Alternative) -> str:
+def alternative_sentence(d: Diagnosis, a: Alternative) -> str:
     """Say which of two causes an exported plant holds, and what that makes of its displacement."""
     apart = phrases.scale_of(d.experiments, a.plant_differs_m).text(a.plant_differs_m, 2)
     inside = any(c.name == a.cause for c in d.model.plant().components)
@@ -235,10 +235,9 @@ def cause_size(d: Diagnosis, cause: Cause) -> str:
     for name, e in cause.parameters.items():
         if name in weights:
             continue
-        unit, display = phrases.shown_in(d.model, name)
-        value, low, high = (convert(v, unit, display) for v in (e.value, *e.interval))
-        estimate = phrases.with_unit(phrases.number(value), display)
-        texts.append(f"{name} = {estimate} ({phrases.interval_text(low, high)})")
+        unit, (value, *ends) = phrases.in_display_unit(d.model, name, e.value, *e.interval)
+        estimate = phrases.with_unit(phrases.number(value), unit)
+        texts.append(f"{name} = {estimate} ({phrases.interval_text(*ends)})")
     if weights:
         texts.append(f"{len(weights)} weights, which shape its loop together")
     return ", ".join(texts)
@@ -301,8 +300,8 @@ def budget_table(d: Diagnosis) -> Table:
     if isinstance(b, StackBudget):
         scale = phrases.scale_of(d.experiments, b.excess_rms_m)
         share = (b.remains_rms_m / b.excess_rms_m) ** 2 if b.excess_rms_m > 0 else 0.0
-        displayed = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
-        left = (_REMAINS, f"{displayed}, {scale.text(b.remains_rms_m)}", "")
+        rest = "under 1 %" if 0.0 < share < 0.005 else phrases.percent(share)
+        left = (_REMAINS, f"{rest}, {scale.text(b.remains_rms_m)}", "")
     return Table(("what", "removes", "95 % interval"), (*rows, left))
 
 

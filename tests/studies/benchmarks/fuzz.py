@@ -9,7 +9,7 @@ import typer
 
 from psa_casadi import InputError
 from psa_casadi.cli.failures import guarded
-from psa_casadi.cli.screen import Quiet, show, working
+from psa_casadi.cli.screen import Quiet, set_quiet, show, working
 from tests.studies.benchmarks.table import TitledTable
 from tests.studies.fuzz import commands, fmus, readers, surroundings
 from tests.studies.fuzz.campaign import KINDS, Tally, Target, replay, run
@@ -97,10 +97,11 @@ def fuzz(
     quiet: Quiet = False,
 ) -> None:
     """Attack the package with damaged inputs; exit code 1 if anything fails."""
+    set_quiet(quiet)
     if again is not None:
         tally = replay(again, TARGETS)
         for distinct in tally.distinct.values():
-            show(distinct.first.detail, quiet)
+            show(distinct.first.detail)
     else:
         targets = chosen_targets([n.strip() for n in only.split(",") if n.strip()])
         each = None if inputs is None else {t.name: inputs for t in targets}
@@ -109,12 +110,12 @@ def fuzz(
             signal.SIGTERM,
         ):  # both end with a table, in the background too
             signal.signal(which, signal.default_int_handler)
-        with working("attacking", quiet) as progress:
+        with working("attacking") as progress:
             tally = run(
                 targets, seed, seconds=seconds if each is None else float("inf"), inputs=each,
                 first=first, jobs=jobs, keep=keep, progress=progress,
             )  # fmt: skip
     for titled in tables(tally):
-        show(f"\n{titled}", quiet)
+        show(f"\n{titled}")
     if tally.failures:
         raise typer.Exit(1)

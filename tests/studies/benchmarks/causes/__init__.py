@@ -9,7 +9,7 @@ import typer
 
 from psa_casadi import InputError
 from psa_casadi.cli.failures import guarded
-from psa_casadi.cli.screen import Quiet, show_table, working
+from psa_casadi.cli.screen import Quiet, set_quiet, show_table, working
 from tests.studies.benchmarks.causes import score
 from tests.studies.benchmarks.causes.data import write
 from tests.studies.benchmarks.causes.methods import METHODS, write_answer
@@ -43,7 +43,8 @@ def write_command(
     """Write the data set: records, base model, possible causes, the truth apart, the score."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} is not empty; give a new folder for the data set.")
-    with working("writing the data set", quiet) as progress:
+    set_quiet(quiet)
+    with working("writing the data set") as progress:
         write(folder, seed, cases, progress, jobs)
 
 
@@ -61,7 +62,8 @@ def answer_command(
     """Answer the data set by psa diagnose, or by PySINDy (pip install pysindy)."""
     if not (folder / "data.json").is_file():
         raise InputError(f"{folder} has no data.json; write a data set there first.")
-    with working("answering", quiet) as progress:
+    set_quiet(quiet)
+    with working("answering") as progress:
         answer_all(folder, answers, method, jobs, progress)
 
 
@@ -73,12 +75,14 @@ def table_command(
     quiet: Quiet = False,
 ) -> None:
     """Write the data set to a temporary folder, answer it both ways, and print the figures."""
+    set_quiet(quiet)
     count = cases or (QUICK if quick else CASES)
-    with tempfile.TemporaryDirectory() as name, working("benchmark causes", quiet) as progress:
+    with tempfile.TemporaryDirectory() as name, working("benchmark causes") as progress:
         data, rows = Path(name) / "data", dict[str, dict[str, str]]()
         write(data, SEED, count, progress, jobs=2)
         for method in METHODS:
             answer_all(data, Path(name) / method, method, 2, progress)
             for figure, value in score.score(data, Path(name) / method)["figures"].items():
                 rows.setdefault(figure, {"figure": figure})[method] = score.formatted(value)
+    set_quiet(False)  # the table is the result
     show_table(TitledTable("Hidden causes", list(rows.values())).table)
