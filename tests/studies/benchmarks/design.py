@@ -11,7 +11,7 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi.design.experiment.criteria import SensorNoise, rival_of_model
 from psa_casadi.design.experiment.experiment import (
-    ASKED,
+    CHANCE,
     PLAYS,
     informative_experiment,
     resolving_experiment,
@@ -171,7 +171,7 @@ def _summary(found: Sequence[Resolved]) -> TitledTable:
         " All further records have the length, the sampling and the voltage range of the first. The"
         " predicted ln B is the growth of the logarithm of the Bayes factor for the less favourable"
         f" of the two truths. Of {len(items)} pairs it was said beforehand that no record found,"
-        f" nor {PLAYS[-1]} of them, would tell with {100.0 * ASKED:.0f} %;"
+        f" nor {PLAYS[-1]} of them, would tell with {100.0 * CHANCE:.0f} %;"
         f" {sum(r.named['designed'] == 'open' for r in items)} of them stayed open with the"
         " designed one.",
     )
