@@ -113,7 +113,7 @@ def with_next(
         return replace(d, next_experiment=replace(before, reasons=reasons))
     write_record(path, experiment.columns_to_play(design))
     reasons = (f"Apply {path} and diagnose all records together.", *each, *same)
-    following = result.NextExperiment(str(path), design.names, reasons, dict(design.chance))
+    following = result.NextExperiment(str(path), tuple(design.chance), reasons, dict(design.chance))
     return replace(d, next_experiment=following)
 
 

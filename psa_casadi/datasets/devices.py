@@ -12,7 +12,7 @@ from psa_casadi.units import ComplexArray, FloatArray
 
 
 def _beside(name: str) -> str:
-    """Return a text that lies beside this file."""
+    """Return a text in the folder of this file."""
     return files("psa_casadi.datasets").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -37,7 +37,7 @@ _HEAD = "time [s],voltage [V],displacement [um]"
 def csv_text(samples: Iterable[tuple[float, float]], sample_rate: float, decimals: int) -> bytes:
     """Return the file of samples of voltage [V] and displacement [um] at a rate [1/s].
 
-    `decimals` are those of the time, which begins at 0.
+    `decimals` are those of the time, which starts at 0.
     """
     rows = [_HEAD]
     for k, (voltage, displacement) in enumerate(samples):
@@ -112,8 +112,8 @@ class OneAxis:
         voltages, displacements = (a[:, :, self.experiment, : self.periods] for a in arrays[-2:])
         axis = own_part(response, voltages, displacements, self.axis)
         voltage = voltages[:, self.axis].T.reshape(-1)
-        displayed = self.sign * 1e6 * axis.T.reshape(-1)
-        pairs = zip(voltage.tolist(), displayed.tolist(), strict=True)
+        displacement = self.sign * 1e6 * axis.T.reshape(-1)
+        pairs = zip(voltage.tolist(), displacement.tolist(), strict=True)
         return csv_text(pairs, self.sample_rate, 8)
 
 
@@ -144,8 +144,7 @@ def own_part(
     others = np.arange(voltages.shape[1]) != axis
     u = np.fft.rfft(voltages[:, others], axis=0)
     done = np.einsum("kj,kjp->kp", response[:, axis, others], u)
-    values: FloatArray = displacements[:, axis] - np.fft.irfft(done, n=len(voltages), axis=0)
-    return values
+    return np.asarray(displacements[:, axis] - np.fft.irfft(done, n=len(voltages), axis=0))
 
 
 @dataclass(frozen=True)
@@ -170,6 +169,11 @@ class Dataset:
     licence: str
     licence_text: str
     files: tuple[DatasetFile, ...]
+
+    @property
+    def originals(self) -> dict[str, Original]:
+        """The files as their authors publish them, by name."""
+        return {o.name: o for file in self.files for o in file.originals}
 
 
 def _originals(folder: str, *names: str) -> tuple[Original, ...]:
@@ -244,7 +248,7 @@ _MIRROR_FOLDER = (
 )
 _RATE = 6400.0
 LEVELS = (100, 200, 300)
-#: Displacements 1 and 2 are measured against the direction of their own actuators.
+#: Displacements 1 and 2 are measured against the direction of their actuators.
 SIGNS = (-1, -1, 1)
 
 
@@ -253,11 +257,11 @@ def _axis(axis: int, level: int, signal: int | None = None) -> DatasetFile:
     name = f"axis_{axis + 1}_{level}mV{'' if signal is None else f'_test_{signal + 1}'}.csv"
     parts = ("train",) if signal is None else ("train", "test")
     originals = [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"]
-    statement = "first training signal" if signal is None else f"test signal {signal + 1}"
+    which = "first training signal" if signal is None else f"test signal {signal + 1}"
     length = "one period" if signal is None else "two periods"
     return _file(
         name,
-        f"axis {axis + 1} and its own actuator, {statement}, {level} mV rms, {length}",
+        f"axis {axis + 1} and its own actuator, {which}, {level} mV rms, {length}",
         _originals(_MIRROR_FOLDER, *originals),
         OneAxis(axis, SIGNS[axis], signal or 0, len(parts), _RATE),
     )
@@ -290,4 +294,4 @@ STEERING_MIRROR_TEST = _mirror(
 _ALL = (MICROMANIPULATOR, MICROMANIPULATOR_RESTS, STEERING_MIRROR, STEERING_MIRROR_TEST)
 
 DATASETS: dict[str, Dataset] = {d.name: d for d in _ALL}
-"""Every dataset by name. A dataset stands here once its licence and its hashes were verified."""
+"""Every dataset by name. A dataset is listed once its licence and its hashes were verified."""

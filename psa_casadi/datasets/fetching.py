@@ -43,14 +43,11 @@ def copy(name: str, folder: str | os.PathLike[str]) -> list[Path]:
     """
     dataset, target = find(name), Path(folder)
     make_folder(target)
-    result = paths(name)
-    written = []
-    for path in result:
-        written.append(target / path.name)
-        atomic_write(written[-1], path.read_bytes())
-    written.append(target / f"{name}_licence.txt")
-    atomic_write(written[-1], origin_text(dataset))
-    return written
+    content: dict[str, bytes | str] = {path.name: path.read_bytes() for path in paths(name)}
+    content[f"{name}_licence.txt"] = origin_text(dataset)
+    for file, data in content.items():
+        atomic_write(target / file, data)
+    return [target / file for file in content]
 
 
 def originals(name: str) -> dict[str, Path]:
@@ -61,21 +58,19 @@ def originals(name: str) -> dict[str, Path]:
         PsaError: a file cannot be downloaded, or what came differs from what was published.
     """
     dataset = find(name)
-    every = {o.name: o for file in dataset.files for o in file.originals}
     data = os.environ.get(DATA_VARIABLE)
-    if data:
-        folder = Path(data) / name
-        return {
-            k: _from_folder(folder, dataset, k, o.sha256, f"download {o.url} to it")
-            for k, o in every.items()
-        }
-    return {k: _download(o, _room(dataset)) for k, o in every.items()}
+    folder = Path(data) / name if data else _room(dataset)
+    return {
+        k: _from_folder(folder, dataset, k, o.sha256, f"download {o.url} to it")
+        if data
+        else _download(o, folder)
+        for k, o in dataset.originals.items()
+    }
 
 
 def origin_text(dataset: Dataset) -> str:
     """Return source, citation, what was taken, and licence, as they go with every copy."""
-    every = {o.name: o for file in dataset.files for o in file.originals}
-    files = "\n".join(f"{o.url} (SHA-256 {o.sha256})" for o in every.values())
+    files = "\n".join(f"{o.url} (SHA-256 {o.sha256})" for o in dataset.originals.values())
     taken = "\n".join(
         f"{f.name}: {f.description}. From {', '.join(o.name for o in f.originals)}:"
         f" {f.conversion.words}."
@@ -131,11 +126,8 @@ def _download(original: Original, folder: Path) -> Path:
 
     pooch.get_logger().setLevel("WARNING")
     try:
-        return Path(
-            pooch.retrieve(
-                original.url, f"sha256:{original.sha256}", fname=original.name, path=folder
-            )
-        )
+        sha, name = f"sha256:{original.sha256}", original.name
+        return Path(pooch.retrieve(original.url, sha, fname=name, path=folder))
     except ValueError as error:
         raise PsaError(
             f"{original.url}: what was downloaded is not the published file, its SHA-256 differs"

@@ -70,8 +70,8 @@ class Linear(Celled):
     @property
     def poles(self) -> ComplexArray:
         """Eigenvalues of A [1/s], the slowest first."""
-        result = np.linalg.eigvals(self.a).astype(complex)
-        return np.asarray(result[np.argsort(np.abs(result))])
+        poles = np.linalg.eigvals(self.a).astype(complex)
+        return np.asarray(poles[np.argsort(np.abs(poles))])
 
     def __repr__(self) -> str:
         """Return the operating point and the poles."""
@@ -145,9 +145,9 @@ def linearize(
     """Linearise a model at rest with constant inputs, or at states.
 
     `inputs` are their values in SI units, by default their starts. A stack rests settled at its
-    voltage. Another model rests where its rates are 0, found from its starts; with `states`, some
-    or all by name, it is linearised there, at rest or not. An imported FMU has its derivatives; one
-    that is run as a whole has none.
+    voltage. Another model rests where its rates are 0, searched from its starts; with `states`,
+    some or all by name, it is linearised there, at rest or not. An imported FMU has its
+    derivatives; one that is run as a whole has none.
 
     Raises InputError for unknown names, sampled states, an FMU that is run as a whole, and where no
     rest is found.
@@ -169,10 +169,8 @@ def linearize(
         )
     u = np.array([arguments.get(i.name, i.start) for i in s.inputs])
     x = np.array([(states or {}).get(q.name, q.start) for q in s.states])
-    p, held = (
-        model.parameter_vector(),
-        tuple(q.name for q in s.states if q.memory and not q.settles),
-    )
+    held = tuple(q.name for q in s.states if q.memory and not q.settles)
+    p = model.parameter_vector()
     if not states:
         x = start_state(model, u.tolist()).x if is_stack(model) else _rest(model, time, x, u)
     a, b, c, d = (np.array(m) for m in s.slopes(time, x, u, p))
@@ -199,17 +197,17 @@ def _rest(model: Model, time: float, x: FloatArray, u: FloatArray) -> FloatArray
     scale = np.maximum(np.max(np.abs(slopes), axis=1), 1e-300)
     try:
         with np.errstate(all="ignore"):  # of what runs away
-            result = scipy.optimize.least_squares(
+            solution = scipy.optimize.least_squares(
                 rates, x / sizes, x_scale="jac", xtol=1e-15, gtol=1e-15
             )
     except (ValueError, RuntimeError) as error:  # rates that are not finite
         raise InputError(f"No rest of '{model.name}' is found ({error}); give `states`.") from error
-    if not np.max(np.abs(result.fun)) <= _REST:
+    if not np.max(np.abs(solution.fun)) <= _REST:
         raise InputError(
             f"No rest of '{model.name}' is found from its starts with these inputs; give `states`,"
             " where it need not rest."
         )
-    return np.asarray(result.x * sizes)
+    return np.asarray(solution.x * sizes)
 
 
 def margins(
@@ -249,7 +247,7 @@ def observer(
     outputs the estimated states, and estimated_y of all outputs. Noises are standard deviations
     [SI] of samples at every `step` [s]: W and V are their variances times the step.
 
-    Raises InputError for unknown names, and where no filter is found, as where an output does not
+    Raises InputError for unknown names, and where no filter exists, as where an output does not
     show a mode that is not damped.
     """
     rows = [_one(of.output_names, n) for n in output_noise]
@@ -276,12 +274,12 @@ def observer(
     )
     moved = u - of.u
     innovation = y - of.y[rows] - c @ x - d @ moved
-    displayed = ca.vertcat(x + of.x, of.y + of.c @ x + of.d @ moved)
+    estimates = ca.vertcat(x + of.x, of.y + of.c @ x + of.d @ moved)
     measured = [of.outputs[r] for r in rows]
-    shown_as: list[State | Output] = [*of.states, *of.outputs]
+    estimated: list[State | Output] = [*of.states, *of.outputs]
     return ode_model(
         {
-            "x": x, "u": ca.vertcat(u, y), "y": displayed,
+            "x": x, "u": ca.vertcat(u, y), "y": estimates,
             "ode": of.a @ x + of.b @ moved + gain @ innovation,
         },
         name=f"{of.name}_observer",
@@ -294,7 +292,7 @@ def observer(
         ],
         outputs=[
             Output(f"estimated_{v.name}", v.unit, f"estimated {v.description}")
-            for v in shown_as
+            for v in estimated
         ],
         description=f"stationary Kalman filter of '{of.name}'",
         source="Kalman and Bucy, J. Basic Eng. 83 (1961), 95",

@@ -4,7 +4,7 @@ The folder of a batch's results: a folder for each device, and tables over all o
 
     RESULTS/
       DEVICE/device.json          how its work ended, for which files and options
-      DEVICE/identification.json  or diagnosis.json: what was found
+      DEVICE/identification.json  or diagnosis.json: the result
       DEVICE/model.json           the model
       summary.csv                 one row for each device; summary.parquet where pyarrow is
 
@@ -67,20 +67,18 @@ class Results:
 
         With the batch and date that it has now, which are written too.
         """
-        device_file = self.told(job.device)
-        if device_file is None or device_file.key != key or device_file.status == "failed":
+        ended, folder = self.device_file(job.device), self.folder / job.device
+        if ended is None or ended.key != key or ended.status == "failed":
             return None
-        if len(device_file.sha256) != len(device_file.files) or damage(
-            self.folder / job.device, device_file
-        ):
+        if len(ended.sha256) != len(ended.files) or damage(folder, ended):
             return None
         day = job.day.isoformat() if job.day else ""
-        if (device_file.batch, device_file.date) != (job.batch, day):
-            device_file = replace(device_file, batch=job.batch, date=day)
-            atomic_write(self.folder / job.device / DEVICE_FILE, json_text(asdict(device_file)))
-        return device_file
+        if (ended.batch, ended.date) != (job.batch, day):
+            ended = replace(ended, batch=job.batch, date=day)
+            atomic_write(folder / DEVICE_FILE, json_text(asdict(ended)))
+        return ended
 
-    def told(self, device: str) -> DeviceFile | None:
+    def device_file(self, device: str) -> DeviceFile | None:
         """Return how a device ended, None where that is not known."""
         path = self.folder / device / DEVICE_FILE
         try:
@@ -121,18 +119,16 @@ class Results:
     def findings(
         self, devices: Sequence[DeviceFile], effects: Sequence[Component] = ()
     ) -> Iterator[tuple[DeviceFile, Finding | None]]:
-        """Yield devices with what was found, None where nothing was.
+        """Yield devices with their findings, None without one.
 
         A device whose files are damaged has failed, with what is wrong among its problems.
         """
-        for output in devices:
+        for d in devices:
             try:
-                finding = None
-                if output.status == "done":
-                    finding = device_finding(self.folder / output.device, output, effects)
-                yield output, finding
+                is_done = d.status == "done"
+                yield d, device_finding(self.folder / d.device, d, effects) if is_done else None
             except ValueError as error:
-                yield replace(output, status="failed", problems=(str(error),)), None
+                yield replace(d, status="failed", problems=(str(error),)), None
 
 
 def read_results(
@@ -150,7 +146,7 @@ def read_results(
             f"{folder}: holds no results of devices; give the folder that `psa batch` wrote to, or"
             " two files or more."
         )
-    devices = {name: results.told(name) for name in names}
+    devices = {name: results.device_file(name) for name in names}
     rows = list(results.findings([d for d in devices.values() if d is not None], effects))
     lost = [(d.device, d.status, " ".join(d.problems)) for d, f in rows if f is None]
     lost += [
@@ -175,12 +171,12 @@ def write_summary(
     empty where the records of a device do not determine it. A column of numbers with a unit that no
     device fills is left out.
     """
-    item = ("device", "batch", "date", "work", "status", "seconds")
+    names = ("device", "batch", "date", "work", "status", "seconds")
     table: list[dict[str, Any]] = [
-        {name: getattr(output, name) for name in item}
-        | {"problems": " ".join(output.problems)}
-        | (finding_content(result) if result else {})
-        for output, result in rows
+        {name: getattr(device, name) for name in names}
+        | {"problems": " ".join(device.problems)}
+        | (finding_content(finding) if finding else {})
+        for device, finding in rows
     ]
     filled = {name for row in table for name, value in row.items() if value is not None}
     every = dict.fromkeys(name for row in table for name in row)
@@ -195,10 +191,9 @@ def write_summary(
         return (folder / CSV,)
     arrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
     kinds = {n: arrow.string() if n in _TEXTS else arrow.float64() for n in columns}
+    content = arrow.Table.from_pylist(table, schema=arrow.schema(kinds.items()))
     with atomic_path(folder / PARQUET) as temporary:
-        parquet.write_table(
-            arrow.Table.from_pylist(table, schema=arrow.schema(kinds.items())), temporary
-        )
+        parquet.write_table(content, temporary)
     return (folder / CSV, folder / PARQUET)
 
 
@@ -242,7 +237,7 @@ def batch(
     """Identify or diagnose many devices; write each result to the folder `output` when it is there.
 
     `jobs` is a folder of records, a table of jobs (`jobs.csv`) or a list of `Job`. `options` say
-    what is done with every device, and with which model, a stack's or one of one's own. `executor`
+    what is done with every device, and with which model, a stack's or any other. `executor`
     is any object with `submit`: an executor of `concurrent.futures`, a client of Dask, mpi4py's;
     without one, `workers` processes (one for each core) do the work, each on one thread. At most
     `at_once` devices are submitted at a time.
@@ -255,7 +250,8 @@ def batch(
     Raises:
         InputError: the jobs cannot be understood, or the results cannot be written.
         MachineError: the executor takes no more work; what is done is kept.
-        KeyboardInterrupt: the run was interrupted; what is done is kept, its message says how much.
+        KeyboardInterrupt: the run was interrupted; what is done is kept, its message states how
+        much.
     """
     began, o = time.monotonic(), options or Options()
     inputs = jobs_given(jobs)
@@ -269,9 +265,8 @@ def batch(
         ) from error
     ended: dict[str, DeviceFile] = {}
     for job in inputs:
-        report = results.kept(job, keys[job.device])
-        if report is not None:
-            ended[job.device] = report
+        if known := results.kept(job, keys[job.device]):
+            ended[job.device] = known
     kept = len(ended)
     waiting = [job for job in inputs if job.device not in ended]
     started = time.monotonic()
@@ -295,9 +290,9 @@ def batch(
     progress("writing the tables")
     rows = list(results.findings([ended[job.device] for job in inputs], effects))
     files = write_summary(results.folder, rows)
-    result = tuple(f for _, f in rows if f is not None)
+    findings = tuple(f for _, f in rows if f is not None)
     devices = tuple(report for report, _ in rows)
-    return BatchRun(results.folder, devices, result, kept, time.monotonic() - began, files)
+    return BatchRun(results.folder, devices, findings, kept, time.monotonic() - began, files)
 
 
 @contextmanager
@@ -307,9 +302,7 @@ def _executor(
     """Yield what takes the work, and how many devices it gets at a time."""
     cores = os.cpu_count() or 1
     if executor is not None:
-        nthreads = getattr(
-            executor, "nthreads", None
-        )  # a client of Dask knows its workers' threads
+        nthreads = getattr(executor, "nthreads", None)  # of a client of Dask: threads by worker
         yield executor, _AHEAD * (sum(nthreads().values()) if nthreads else cores)
         return
     processes = Processes(max(1, min(workers or cores, jobs)))
@@ -322,7 +315,7 @@ def _executor(
 def _line(
     last: DeviceFile, ended: Sequence[DeviceFile], kept: int, total: int, seconds: float
 ) -> str:
-    """Return the line that tells how far a batch is; a device takes so many seconds."""
+    """Return the line on the progress of a batch; `seconds` is the time that a device takes."""
     there, left = len(ended), (total - len(ended)) * seconds
     failed = sum(d.status != "done" for d in ended[kept:])
     lost = f", {failed} without a result" if failed else ""

@@ -1,4 +1,4 @@
-"""The work on one device, in whatever process or thread it runs: on one thread, its error told."""
+"""The work on one device, in any process or thread: on one thread, with its error as result."""
 
 import threading
 import time
@@ -77,9 +77,8 @@ def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
         if o.work == "diagnose":
             words["effects"] = tuple(known_effects(effects).values())
     else:
-        records = read_signals(
-            job.files, inputs=start.input_names, outputs=start.output_names, **table
-        )
+        table |= {"inputs": start.input_names, "outputs": start.output_names}
+        records = read_signals(job.files, **table)
         inputs, words = (start, records), dict(o.words)
     _refuse_same(records)
     work: Callable[..., Any] = diagnose if o.work == "diagnose" else identify
@@ -108,7 +107,7 @@ def _refuse_same(records: Sequence[Record | Signals]) -> None:
 
 
 def make_ready(job: Job, options: Options) -> None:
-    """Compile what the first device will need; what fails is told by the device's own work.
+    """Compile what the first device will need; what fails is reported by the device's work.
 
     They lie in the cache of the user, where every process on this machine finds them.
     """
@@ -120,7 +119,7 @@ def make_ready(job: Job, options: Options) -> None:
         start = starting_model(records, options.stiffness)
         models = [start]
         if options.work == "diagnose":
-            items = [c for module in options.modules for c in own_effects(module).values()]
-            table = known_effects(items).values()
-            models += [start.with_effect(e) for e in table if not e.needs_column]
+            effects = [c for module in options.modules for c in own_effects(module).values()]
+            known = known_effects(effects).values()
+            models += [start.with_effect(e) for e in known if not e.needs_column]
         compiled(models)

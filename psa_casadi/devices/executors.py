@@ -25,14 +25,14 @@ from psa_casadi.processes import ONE_THREAD
 LOCAL = "local"
 #: Time [s] that a scheduler may take to answer, and between two looks whether the run is to end.
 _PATIENCE, _LOOK = 20, 0.2
-#: What differs from Dask's own choices in a cluster made here. Dask has every worker give freed
+#: What differs from Dask's defaults in a cluster made here. Dask has every worker give freed
 #: memory back at once (MALLOC_TRIM_THRESHOLD_) and looks at its stack 100 times a second; the first
 #: costs a device a quarter of its time, and nobody reads the second.
 _OURS = {
     "distributed.nanny.pre-spawn-environ": ONE_THREAD,
     "distributed.worker.profile.enabled": False,
 }
-#: What Dask logs, with tracebacks, of a scheduler that is lost; the work that is lost tells it.
+#: What Dask logs, with tracebacks, of a scheduler that is lost; the lost work reports it.
 _SILENT = dict.fromkeys(("distributed", "distributed.client", "tornado.application"), "critical")
 
 
@@ -48,8 +48,8 @@ def outcomes(
 ) -> Iterator[tuple[DeviceTask, DeviceOutcome]]:
     """Yield tasks with their outcomes in the order in which they end.
 
-    At most `at_once` are submitted and not ended. At an interrupt, what has not begun is cancelled
-    and what runs in this process stopped.
+    At most `at_once` are submitted and not ended. At an interrupt, what has not started is
+    cancelled and what runs in this process stopped.
 
     Raises:
         MachineError: the executor takes no more work, or has lost what it had.
@@ -100,11 +100,9 @@ def _outcome(future: Any, task: DeviceTask, began: float) -> DeviceOutcome:
             " a new one."
         ) from error
     except Exception as error:  # noqa: BLE001 - a cluster may raise anything for a lost worker
-        output = (
-            str(error) if isinstance(error, MachineError) else f"{type(error).__name__}: {error}"
-        )
+        kind = "" if isinstance(error, MachineError) else f"{type(error).__name__}: "
         seconds = time.monotonic() - began
-        return DeviceOutcome(task.job.device, "failed", seconds, problems=(output,))
+        return DeviceOutcome(task.job.device, "failed", seconds, problems=(f"{kind}{error}",))
 
 
 @contextmanager
@@ -137,7 +135,7 @@ def dask_client(address: str, workers: int | None = None) -> Iterator[Any]:
                         )
                     )
             else:
-                with ThreadPoolExecutor(1) as pool:  # a notebook's thread has a loop of its own
+                with ThreadPoolExecutor(1) as pool:  # a notebook's thread has an event loop already
                     pool.submit(asyncio.run, _reach(distributed, address)).result()
             client = distributed.Client(where, timeout=_PATIENCE, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:

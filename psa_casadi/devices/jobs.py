@@ -5,7 +5,7 @@ The table of jobs, jobs.csv: device, and where they are known batch, date and fi
     device,batch,date,files
     A1,2026-03,2026-03-14,A1/slow.csv;A1/fast.csv
 
-Files lie beside the table or in folders below it, with semicolons between. Without the column, the
+Files lie next to the table or in folders below it, with semicolons between. Without the column, the
 records of a device are its folder or the file of its name. Rows of one device are joined.
 """
 
@@ -56,7 +56,7 @@ class Job:
     day: date | None = None
 
 
-#: What stands for the jobs: a folder of records, a table of jobs, or jobs.
+#: What a user may pass as jobs: a folder of records, a table of jobs, or jobs.
 Jobs = str | os.PathLike[str] | Iterable[Job]
 
 
@@ -64,7 +64,7 @@ def jobs_given(inputs: Jobs) -> tuple[Job, ...]:
     """Return the jobs of a folder, a table or a list, in their order.
 
     In a folder with `jobs.csv` that is the table; else every folder in it is a device with all
-    records inside, and so is every record beside them.
+    records inside, and so is every record next to them.
 
     Raises:
         InputError: every mistake: no records, names that two devices have or that no folder can
@@ -92,11 +92,8 @@ def _of_path(path: Path) -> tuple[Job, ...]:
         raise InputError(f"{path}: there is no such folder or table of jobs; correct its name.")
     if (path / TABLE).is_file():
         return _of_table(path / TABLE)
-    jobs = tuple(
-        Job(_named(entry), files)
-        for entry in sorted(path.iterdir())
-        if (files := _records_of(entry))
-    )
+    entries = sorted(path.iterdir())
+    jobs = tuple(Job(_named(e), files) for e in entries if (files := _records_of(e)))
     if not jobs:
         raise InputError(
             f"{path}: holds no records; give a folder with a folder or file for each device,"
@@ -169,11 +166,11 @@ def _day(text: str | None, where: str, problems: Problems) -> date | None:
 
 
 def _usual(table: Path, device: str) -> tuple[str, ...]:
-    """Return the records that have a device's name beside its table: a folder, or a file."""
+    """Return the records that have a device's name next to its table: a folder, or a file."""
     if _BARRED.search(device):
         return ()
-    items = sorted(f for f in table.parent.iterdir() if f.is_file() and _named(f) == device)
-    return _records_of(table.parent / device) or tuple(n for f in items for n in _records_of(f))
+    files = sorted(f for f in table.parent.iterdir() if f.is_file() and _named(f) == device)
+    return _records_of(table.parent / device) or tuple(n for f in files for n in _records_of(f))
 
 
 def _named(place: Path) -> str:
@@ -216,8 +213,9 @@ class Options:
     """How every device is worked on; plain values, so that a process elsewhere can take them.
 
     `model` is the text of the MODEL.json to start from, or a model; `stiffness` in N/m, `columns`
-    and `sample_time` [s] as for `read_record`, `modules` those that hold own effects. `words` are
-    those that `identify` and `diagnose` take with a model of one's own, such as `known_start`.
+    and `sample_time` [s] as for `read_record`, `modules` those that hold the user's effects.
+    `words` are those that `identify` and `diagnose` take with a model that is no stack, such as
+    `known_start`.
     """
 
     work: Work = "identify"
@@ -259,10 +257,9 @@ def key_of(job: Job, options: Options) -> str:
     """
     files = [(Path(f).name, sha256(Path(f).read_bytes()).hexdigest()) for f in job.files]
     model = options.model
-    if isinstance(model, Model):  # by what it says, as a text does
-        model = repr(
-            ([declaration_hash(c) for c in model.components], sorted(model.values.items()))
-        )
+    if isinstance(model, Model):  # by its content, as a text is
+        hashes = [declaration_hash(c) for c in model.components]
+        model = repr((hashes, sorted(model.values.items())))
     content = asdict(replace(options, model=model))
     table = {"version": __version__, "options": content, "files": files}
     return sha256(json.dumps(table, sort_keys=True).encode()).hexdigest()

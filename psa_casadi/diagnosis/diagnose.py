@@ -57,7 +57,7 @@ from psa_casadi.progress import Progress, silent
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
-from psa_casadi.records.suspects import cleaned, masked, suspects
+from psa_casadi.records.suspects import cleaned, suspects
 from psa_casadi.simulation.side_by_side import compiled_ahead, one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
 from psa_casadi.units import FloatArray
@@ -404,7 +404,7 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     refuse_wrapped(records)
     refuse_other_time(records)
     items = [suspects(r) for r in records]
-    clean = [masked(r, s) for r, s in zip(records, items, strict=True)]
+    clean = [cleaned(r, s) for r, s in zip(records, items, strict=True)]
     saturation = tuple(
         s for r, item in zip(records, items, strict=True) for s in item.saturation(r.name)
     )

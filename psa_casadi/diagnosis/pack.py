@@ -17,7 +17,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import relevelled
 from psa_casadi.model.ranges import inside_ranges
-from psa_casadi.records.drive import tells_tone
+from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import linear_part
@@ -201,7 +201,7 @@ class StackPack(Pack):
         tone = cause.tone
         hum = cause.belongs_to == "environment"
         if tone is not None and not all(
-            tells_tone(values[tone], e.record, hum=hum) for e in experiments
+            is_tone_separable(values[tone], e.record, hum=hum) for e in experiments
         ):
             return False
         if tone is not None and hum and _rings_at(fit, values[tone]):

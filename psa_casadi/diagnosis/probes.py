@@ -32,7 +32,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, outputs_of, trace_record
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 from psa_casadi.model.compose import Model
-from psa_casadi.records.drive import tells_tone
+from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.noise import peaks as highest_peaks
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
@@ -76,7 +76,7 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
     order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
     record = experiment.record
-    tones = [k for k in order if tells_tone(frequency[k], record, hum=True)]
+    tones = [k for k in order if is_tone_separable(frequency[k], record, hum=True)]
     strongest = np.array(tones[:_PEAKS], dtype=int)
     return tuple(float(f) for f in np.sort(frequency[strongest])) or (
         0.1 / experiment.record.sample_time,
@@ -327,7 +327,7 @@ def _probe_values(
             places = [f for f in peaks[grid] if low < f < high]
             if grid == SPECTRAL_PEAKS and effect.belongs_to != "environment":
                 first = experiments[0].record  # a resonance answers at the drive's harmonics only
-                places = [f for f in places if tells_tone(f, first, hum=False)]
+                places = [f for f in places if is_tone_separable(f, first, hum=False)]
             grids.append(tuple(places))
         else:
             grids.append(grid)

@@ -19,7 +19,7 @@ from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import MOST, Channel, Experiment
-from psa_casadi.records.suspects import cleaned, masked, suspects
+from psa_casadi.records.suspects import cleaned, suspects
 
 #: The columns of a stack that are fitted beside its displacement, by name. The charge on a stack is
 #: that of its capacitance and, by reciprocity, a share of the displacement; the current is its
@@ -52,7 +52,7 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
     averages lose nothing, they take the samples' place.
     """
     result = suspects(record)
-    clean, clocks = on_one_clock(masked(record, result))
+    clean, clocks = on_one_clock(cleaned(record, result))
     statement: tuple[Note | str, ...] = (*result.notes(record.name), *clocks)
     shorter, averages = _averaged(clean)
     return shorter, (*statement, *averages)
@@ -137,7 +137,7 @@ def with_levels(
             spread = max(float(np.std(v)) for v in values)
             level = max(noise, _FIRST_LEVEL * spread)
             levels.append(replace(COLUMNS[column], level=level))
-    return tuple(e.beside(levels) for e in experiments)
+    return tuple(e.with_further(levels) for e in experiments)
 
 
 def _says_nothing(column: str, records: Sequence[Record]) -> str:

@@ -114,7 +114,7 @@ def relevelled(
         same = all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs)
         if best.interrupted or same:
             break
-        now = tuple(e.beside(levels[every:]) for e in now)
+        now = tuple(e.with_further(levels[every:]) for e in now)
         sigma = [max(levels[0].level, 1e-300)] * len(now) if every else best.sigma
         best = refit_or_keep(best, now, sigma=sigma, tolerance=1e-6 if every else 1e-5)
     return best, now
@@ -122,7 +122,7 @@ def relevelled(
 
 def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]:
     """Return the experiments with the levels of the further channels that weighted a fit."""
-    return [e.beside(f.channel for f in before.further) for e in experiments]
+    return [e.with_further(f.channel for f in before.further) for e in experiments]
 
 
 #: Noise is estimated from so many samples or more, and differs from so many standard errors on.

@@ -326,7 +326,7 @@ def loads_as_curves(
         sign = np.sign(np.cov(load[observed], y[observed])[0, 1]) or 1.0
         text = np.where(observed, load * sign * e.record.range_m / span, np.nan)
         record = replace(e.record, displacement=text, load_force=None)
-        as_displacement.append(replace(e, record=record).beside(()))
+        as_displacement.append(replace(e, record=record).with_further(()))
     ways = [
         fit_base(start, item, progress=progress).predicted(item)
         for item in (unloaded, tuple(as_displacement))

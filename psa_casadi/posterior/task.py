@@ -280,7 +280,7 @@ def _around(
         ]
         displayed = predict(centre, experiments, unknowns, theta, way=way, further=True)
         levels = [f.relevelled() for f in further_of(experiments, displayed)]
-        experiments = tuple(e.beside(levels) for e in experiments)
+        experiments = tuple(e.with_further(levels) for e in experiments)
     return _task(centre, tuple(experiments), unknowns, result, way, sigma, sentences)
 
 

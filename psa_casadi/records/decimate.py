@@ -30,7 +30,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
     per volt. q doubles as long as, with blocks of length h:
 
     * the voltage is uniform in time, and straight lines between its averages meet every sample
-      to within 0.1 noise/slope, the voltage's own white noise aside; so do those of a load force
+      to within 0.1 noise/slope, apart from the voltage's white noise; so do those of a load force
       to within a thousandth of its range;
     * averaging moves the displacement, y'' h^2 / 24 in a block, by less than 0.1 noise/sqrt(q);
     * what averaging takes out of the displacement is white: no line and no hump in the spectrum;
@@ -96,13 +96,17 @@ def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: 
         least = 1e-3 * float(np.ptp(record.load_force)) + 1e-300
         if not _followed(record, wider, record.load_force, wider.load_force, q, least):
             return False
-    if record.displacement is None or wider.displacement is None:
+    y, means = record.displacement, wider.displacement
+    if y is None or means is None:
         return True
     if wider.mask.sum() < 0.98 * record.mask.sum() / q:
         return False
     valid = _blocks(record.mask, q).sum(axis=1)
     least = int(np.min(valid[2 * valid >= q], initial=q))
-    return _straight(wider.displacement, noise / np.sqrt(least)) and _white(record, wider, q)
+    known = wider.mask
+    taken = np.nan_to_num(y) - _lines(record.time, wider.time[known], means[known])
+    white = np.where(record.mask, taken, 0.0)
+    return _straight(means, noise / np.sqrt(least)) and _is_white(white, q)
 
 
 def _followed(
@@ -110,11 +114,11 @@ def _followed(
 ) -> bool:
     """Whether straight lines between the means meet the signal, but for its white noise."""
     error = signal - _lines(record.time, wider.time, means)
-    value = fast_noise(signal)
+    noise = fast_noise(signal)
     smooth = np.convolve(error, np.ones(q) / q, mode="valid")
     return bool(
-        np.max(np.abs(error)) <= allowed + LARGEST * value * np.sqrt(1.0 + 1.0 / q)
-        and np.max(np.abs(smooth)) <= allowed + LARGEST * value / np.sqrt(q)
+        np.max(np.abs(error)) <= allowed + LARGEST * noise * np.sqrt(1.0 + 1.0 / q)
+        and np.max(np.abs(smooth)) <= allowed + LARGEST * noise / np.sqrt(q)
     )
 
 
@@ -131,7 +135,7 @@ def _straight(means: FloatArray, noise: float) -> bool:
     """Whether averaging moved no mean by more than a tenth of its noise.
 
     A bend of the means, y'' h^2, is 24 times that. Over five means the noise of a bend is 0.4 of
-    theirs; one alone is held against its own noise, 2.45 times theirs.
+    theirs; one alone is compared with its noise, 2.45 times theirs.
     """
     bends = np.diff(means, 2)
     bends = bends[np.isfinite(bends)]
@@ -144,27 +148,20 @@ def _straight(means: FloatArray, noise: float) -> bool:
     )
 
 
-def _white(record: Record, wider: Record, q: int) -> bool:
-    """Whether what averaging took out of the displacement has no line and no hump.
+def _is_white(taken: FloatArray, q: int) -> bool:
+    """Whether what averaging took out of the displacement (n,) has no line and no hump.
 
     Above the new Nyquist frequency the power of white noise at neighbouring frequencies is
     independent and exponentially distributed: no line beyond ln(n) + 10 times the local mean, no
     mean of 64 lines beyond twice it.
     """
-    if record.displacement is None or wider.displacement is None:
-        return True
-    known = np.isfinite(wider.displacement)
-    lines = _lines(record.time, wider.time[known], wider.displacement[known])
-    taken = np.where(record.mask, np.nan_to_num(record.displacement) - lines, 0.0)
     power = np.abs(np.fft.rfft(taken)) ** 2
-    upper = power[int(np.ceil(record.n / (2 * q))) : -1]
+    upper = power[int(np.ceil(taken.size / (2 * q))) : -1]
     parts = np.array_split(upper, max(1, upper.size // _AROUND))
     middle = np.cumsum([p.size for p in parts]) - np.array([p.size for p in parts]) / 2.0
     medians = np.array([float(np.median(p)) for p in parts])  # which lines do not move
     local = np.interp(np.arange(upper.size), middle, medians / np.log(2.0))
-    local = np.maximum(local, 1e-300)
-    hump = np.convolve(upper / local, np.ones(_HUMP) / _HUMP, mode="valid")
-    return bool(
-        np.max(upper / local) < np.log(upper.size) + 10.0
-        and np.max(hump) < 1.0 + 8.0 / np.sqrt(_HUMP)
-    )
+    ratio = upper / np.maximum(local, 1e-300)
+    hump = np.convolve(ratio, np.ones(_HUMP) / _HUMP, mode="valid")
+    no_line = np.max(ratio) < np.log(upper.size) + 10.0
+    return bool(no_line and np.max(hump) < 1.0 + 8.0 / np.sqrt(_HUMP))

@@ -9,7 +9,7 @@ _DOMINANT = 0.5
 _SIDE_LINES = 5
 _ORDERS = 12
 #: Mains frequencies [Hz] and their harmonics; how far a grid is off them; and how many of a
-#: record's resolutions a line lies off the drive's harmonics to be told from them.
+#: record's resolutions a line lies off the drive's harmonics to be no harmonic.
 _MAINS, _MULTIPLES, _OFF, _APART = (50.0, 60.0), 3, 0.004, 2.0
 
 
@@ -42,11 +42,11 @@ def is_mains(frequency: float) -> bool:
     return any(k and abs(frequency - k * mains) < _OFF * frequency for k, mains in orders)
 
 
-def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
-    """Whether a record tells a tone [Hz] from its drive; a `hum` on the mains, too.
+def is_tone_separable(frequency: float, record: Record, *, hum: bool) -> bool:
+    """Whether a tone [Hz] is distinguishable from the drive; with `hum` lines of the mains count.
 
     A resonance answers a periodic drive at the drive's harmonics only, and so does distortion: in
-    the range of its first twelve such a record cannot tell the two apart, but for a line of the
+    the range of its first twelve the two are indistinguishable, except for a line of the
     mains or its harmonics that is none of the drive's.
     """
     drive = drive_frequency(record)
@@ -54,8 +54,8 @@ def tells_tone(frequency: float, record: Record, *, hum: bool) -> bool:
         return True
     lines = [m * mains for mains in _MAINS for m in range(1, _MULTIPLES + 1)]
     near = any(abs(frequency - line) < _OFF * line for line in lines)
-    item = abs(frequency - round(frequency / drive) * drive) <= _APART / record.duration
-    return hum and near and not item
+    is_harmonic = abs(frequency - round(frequency / drive) * drive) <= _APART / record.duration
+    return hum and near and not is_harmonic
 
 
 def turns(voltage: FloatArray, share: float = 0.1) -> bool:

@@ -1,6 +1,6 @@
 """Test voltages for planned experiments, as samples on a time grid.
 
-Every function takes instants `time` [s], shape (n,), that begin at the start of its own part, and
+Every function takes instants `time` [s], shape (n,), that begin at the start of its part, and
 the lowest and highest voltage `low`, `high` [V] that the stack may see, and returns voltages [V],
 shape (n,), which never leave that range and begin at `low`, but for the multisine. Between samples
 the voltage is meant to be linear.
@@ -58,7 +58,7 @@ def decaying_triangle(
 
     `v(t_j) = centre + (1 - j/(2 N)) (e_j - centre)`, `t_j = j T/(2 N)`, j = 0 .. 2 N, linear in
     between; `e_j` is `low` for even and `high` for odd j, T the length of the grid, N = `periods`.
-    `centre` is the middle unless given; `low` keeps all the loops on one foot.
+    `centre` is the middle by default; `low` keeps all the loops on one foot.
     Use: nested minor loops, that is the memory of hysteresis; also to depolarise before a record.
 
     Raises:

@@ -43,8 +43,7 @@ def filtered(
         return values
     bands = np.repeat(np.asarray(lower, dtype=float)[: len(x), None], len(x), axis=1)
     solved = scipy.linalg.lapack.dtbtrs(bands, values.reshape(len(x), -1), uplo="L")[0]
-    recursive: FloatArray = solved.reshape(x.shape)
-    return recursive
+    return np.asarray(solved.reshape(x.shape))
 
 
 def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
@@ -52,8 +51,7 @@ def convolved(x: FloatArray, kernel: FloatArray) -> FloatArray:
     n, reach = len(x), len(kernel) // 2
     size = scipy.fft.next_fast_len(n + len(kernel) - 1, real=True)
     spectrum = scipy.fft.rfft(x, size, axis=0) * scipy.fft.rfft(kernel, size)[:, None]
-    whole: FloatArray = scipy.fft.irfft(spectrum, size, axis=0)[reach : reach + n]
-    return whole
+    return np.asarray(scipy.fft.irfft(spectrum, size, axis=0)[reach : reach + n])
 
 
 def peaks(values: FloatArray, apart: int, most: int) -> IndexArray:
@@ -69,14 +67,14 @@ def peaks(values: FloatArray, apart: int, most: int) -> IndexArray:
     return np.array(chosen, dtype=np.int64)
 
 
-#: A line is one that noise would show in one of so many records; so many are sought at most.
+#: Probability that white noise has a line in a record; number of lines at most.
 _CHANCE, _LINES = 1e-4, 24
-#: The lowest frequency [1/duration] at which a line can be told from drift; widest surroundings.
+#: The lowest frequency [1/duration] of a line (below it is drift); widest surroundings.
 _LOWEST, _WIDEST = 8, 64
 
 
 def lines_in(power: FloatArray) -> tuple[IndexArray, FloatArray]:
-    """Return where a line stands out of its surroundings, and the mean power of those (n,).
+    """Return the lines that exceed their surroundings, and the mean power of the latter (n,).
 
     `power` (n,) is a periodogram under Hann's window; the strongest line is the first one. Powers
     of noise are exponentially distributed, their median ln 2 times their mean.
@@ -94,8 +92,8 @@ def lines_in(power: FloatArray) -> tuple[IndexArray, FloatArray]:
     limit = 1.4 * around * (np.log(power.size) - np.log(_CHANCE))
     inner = np.arange(max(_LOWEST, 3), power.size - 3)
     highest = np.max([power[inner + d] for d in (-3, -2, -1, 1, 2, 3)], axis=0)
-    result = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
-    return result[np.argsort(-power[result])[:_LINES]], around
+    lines = inner[(power[inner] > limit[inner]) & (power[inner] > highest)]
+    return lines[np.argsort(-power[lines])[:_LINES]], around
 
 
 def growth(squares: FloatArray, sizes: FloatArray) -> tuple[float, float]:
@@ -158,7 +156,7 @@ def last_place_of(signal: FloatArray) -> float:
         step = 10.0**-k
         if largest < _LEAST * step:
             continue
-        if largest > step / (_NEAR * np.finfo(float).eps):  # no double tells
+        if largest > step / (_NEAR * np.finfo(float).eps):  # beyond the precision of a double
             break
         places = signal / step
         if np.all(np.abs(places - np.round(places)) < _NEAR):
@@ -197,7 +195,7 @@ _SQUARES = (0.5625, 0.09, 0.0025)
 #: Samples in a segment, the fewest segments, and the fast frequencies [cycles per sample].
 _SEGMENT, _FEWEST_SEGMENTS, _FAST = 128, 4, 0.045
 _CORRELATIONS = np.arange(0.0, 0.96, 0.01)
-#: A correlation counts from here on, and from so many times 1/sqrt(n): three standard errors.
+#: A correlation counts from here on, and from this many times 1/sqrt(n): three standard errors.
 _CORRELATED, _SURE = 0.1, 6.0
 
 
@@ -221,7 +219,7 @@ def high_frequency_noise(signal: FloatArray) -> float:
     count = len(squares) // length
     powers = np.mean(squares[: count * length].reshape(count, length), axis=1)
     similar = sum((1.0 - k / length) * r for k, r in enumerate(_SQUARES, 1) if k < length)
-    freedom = length / (1.0 + 2.0 * similar)  # of the mean square of so many third differences
+    freedom = length / (1.0 + 2.0 * similar)  # of the mean square of `length` third differences
     power = float(np.median(powers)) / (1.0 - 2.0 / (9.0 * freedom)) ** 3
     return min(float(np.sqrt(power)), float(np.std(signal))) if power > 0 else float(np.std(signal))
 
@@ -232,7 +230,7 @@ def first_order_noise(signal: FloatArray) -> tuple[float, float]:
     Noise e_k = r e_(k-1) + w_k has the density S(f) = S_w/(1 - 2 r cos(2 pi f) + r^2), f in cycles
     per sample, and the variance S_w/(1 - r^2). Both are fitted to the medians of short periodograms
     at the fast frequencies, where what is smooth has no power; least absolute deviations of their
-    logarithms leave lines and moments of a misfit aside. Where no r can be told from 0 the white
+    logarithms are insensitive to lines and moments of a misfit. If no r differs from 0 the white
     part of `high_frequency_noise` is the noise. The rms is at most that of the signal.
     """
     n, white = len(signal), high_frequency_noise(signal)
@@ -308,10 +306,10 @@ def autocovariance(residual: FloatArray) -> FloatArray:
 def lag_products(d: FloatArray, lags: int) -> FloatArray:
     """Return sum_i d_i d_(i+k) for k < lags."""
     size = scipy.fft.next_fast_len(d.size + lags, real=True)
-    result = np.zeros(lags)
+    products = np.zeros(lags)
     matches = scipy.fft.irfft(np.abs(scipy.fft.rfft(d, size)) ** 2, size)[: min(lags, d.size)]
-    result[: matches.size] = matches
-    return result
+    products[: matches.size] = matches
+    return products
 
 
 def forgets(correlation: FloatArray) -> float:

@@ -4,7 +4,7 @@ A residual is a sum of what follows the drive, of lines, of jumps between levels
 a spectrum, whose innovations may have heavy tails, outliers, or a size that grows with the
 reading's rate, as a clock that jitters by t makes it: s^2 + t^2 (dy/dt)^2. Each is added where it
 gains more likelihood than its parameters cost by Schwarz' criterion. What follows the drive is a
-misfit of the model and no noise; where it may be that, only the colour is said.
+misfit of the model and no noise; if it may be that, only the colour is stated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,6 @@ import scipy
 
 from psa_casadi.notes import Note, note
 from psa_casadi.records.drive import dominant_line, is_mains, reversals
-from psa_casadi.records.driven import columns_of, followed, period_of, returning
-from psa_casadi.records.jumps import Jumps, jumps_in
 from psa_casadi.records.noise import (
     forgets,
     growth,
@@ -26,6 +24,14 @@ from psa_casadi.records.noise import (
     lag_products,
     local_scale,
     quantum_of,
+)
+from psa_casadi.records.noise_parts import (
+    Jumps,
+    columns_of,
+    followed,
+    jumps_in,
+    period_of,
+    returning,
 )
 from psa_casadi.records.noise_spectra import (
     LEAST,
@@ -48,7 +54,7 @@ Kind = Literal[
 FEWEST = 200
 #: Median filter of a robust residual, and standard deviations of what is put aside for its colour.
 _WIDTH, _ASIDE = 5, 5.0
-#: Rounding is all that is seen where the residual is at most so many times q / sqrt(12).
+#: The residual is rounding alone if its rms is at most this many times q / sqrt(12).
 _ROUNDED = 1.5
 
 
@@ -61,7 +67,7 @@ class NoiseKind:
     | white | rms | |
     | autoregressive | rms, order, time of correlation [s], peak of the spectrum [Hz] if any | |
     | one_over_f | rms, slope a of f^-a, corner [Hz] above which it is white, if any | |
-    | coloured | rms, time [s]: noise or misfit, which of them is not told | |
+    | coloured | rms, time [s]: noise or misfit, which are indistinguishable here | |
     | telegraph | count of jumps, apart: the distance of the two levels | |
     | steps | count, size | the first three [s] |
     | heavy_tails | freedom: degrees of freedom of Student's t | |
@@ -91,7 +97,7 @@ class NoiseFound:
 
 
 def notes_of(noise_founds: Sequence[NoiseFound]) -> tuple[Note, ...]:
-    """Return what is said of noises, one note for each kind in each output, the figures of one.
+    """Return one note for each kind of noise in each output, with the figures of one record.
 
     White noise, and a misfit, need no word.
     """
@@ -125,23 +131,22 @@ def noise_kinds(
     if np.count_nonzero(there) < FEWEST or not np.ptp((reading - predicted)[there]) > 0.0:
         return ()
     dt = float(np.median(np.diff(time)))
-    result = _dropped(time, dt)
+    kinds = _dropped(time, dt)
     quantum = quantum_of(reading[there]) or 0.0
     again = _held(reading, predicted, there, quantum)
     there = there & ~again
     if again.any():
         share = again.sum() / (again.sum() + there.sum())
         ends = np.diff(np.flatnonzero(there), prepend=-1, append=there.size)
-        result.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
+        kinds.append(NoiseKind("held", {"share": float(share), "run": float(np.median(ends))}))
     index = np.flatnonzero(there)
     if index.size < FEWEST:
-        return tuple(result)
+        return tuple(kinds)
     residual = (reading - predicted)[there]
     rms = float(np.std(residual))
     if rms <= _ROUNDED * quantum / np.sqrt(12.0):
-        return (*result, NoiseKind("quantised", {"step": quantum, "rms": rms}))
-    observed = _Seen(time, predicted, tuple(inputs), index, dt, residual)
-    return (*result, *observed.kinds())
+        return (*kinds, NoiseKind("quantised", {"step": quantum, "rms": rms}))
+    return (*kinds, *_Residual(time, predicted, tuple(inputs), index, dt, residual).kinds())
 
 
 def _dropped(time: FloatArray, dt: float) -> list[NoiseKind]:
@@ -153,7 +158,7 @@ def _dropped(time: FloatArray, dt: float) -> list[NoiseKind]:
     return [NoiseKind("dropped", {"count": float(missing)})] if even and missing else []
 
 
-#: Readings that repeat beyond so many times chance by this share of all are held, where chance does
+#: Readings are held if the share that repeats exceeds a multiple of chance, where chance does
 #: not make as many as this; below this share of the range there is no noise, and no motion.
 _REPEATED, _BY_CHANCE, _OFTEN, _QUIET = 0.02, 3.0, 0.1, 1e-6
 
@@ -174,7 +179,7 @@ def _held(
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _Residual:
     """A residual (m,) at samples `index` of the record's n, every `dt` seconds."""
 
     time: FloatArray
@@ -189,34 +194,34 @@ class _Seen:
         flat = self.residual - np.mean(self.residual)
         robust = _robust(flat)
         jumps, misfit, colour = self._parts(robust)
-        result = [] if jumps is None else [self._jumping(jumps)]
+        kinds = [] if jumps is None else [self._jumping(jumps)]
         left = robust - misfit - (0.0 if jumps is None else jumps.levels)
         if misfit.any():
             share = 1.0 - float(left @ left) / max(float(np.sum((left + misfit) ** 2)), 1e-300)
-            result.append(NoiseKind("misfit", {"share": share}))
-        lines, of_drive, tones = self._tones(left, beside=bool(misfit.any()))
-        result += lines
+            kinds.append(NoiseKind("misfit", {"share": share}))
+        lines, of_drive, tones = self._tones(left, has_misfit=bool(misfit.any()))
+        kinds += lines
         if tones.any():
             left = left - tones
             colour = colour_of(left)
-        if jumps is not None and (jumps.alternate or colour.gain < _SLIGHT * LEAST):
+        if jumps is not None and (jumps.alternate or colour.gain < _UNDETECTED * LEAST):
             colour = WHITE
         white = colour.whitened(left)
         new = float(np.var(white) / np.var(left)) if colour.family == "autoregressive" else 1.0
         smooth = colour.figures.get("slope", 0.0) > _SMOOTH or new < _PREDICTED
         white = white + flat - robust
-        output = colour.told and not smooth and not of_drive and self._is_noise(left, misfit)
-        sure = colour is WHITE or output
+        is_noise = colour.is_clear and not smooth and not of_drive and self._is_noise(left, misfit)
+        sure = colour is WHITE or is_noise
         figures = colour.figures if sure else {"time": forgets(lag_products(left, left.size // 2))}
         units = {"time": self.dt, "corner": 1.0 / self.dt, "peak": 1.0 / self.dt}
         figures = {name: value * units.get(name, 1.0) for name, value in figures.items()}
         kind = colour.family if sure else "coloured"
-        result.append(NoiseKind(kind, {"rms": float(np.std(left)), **figures}))
+        kinds.append(NoiseKind(kind, {"rms": float(np.std(left)), **figures}))
         if jumps is not None and jumps.alternate:
-            return result
+            return kinds
         if jumps is not None:
             white[np.clip(jumps.places[:, None] + np.arange(-2, 2), 0, white.size - 1)] = 0.0
-        return result + self._innovations(white, sure and jumps is None, (flat != robust) | sure)
+        return kinds + self._innovations(white, sure and jumps is None, (flat != robust) | sure)
 
     def _parts(self, robust: FloatArray) -> tuple[Jumps | None, FloatArray, Colour]:
         """Return jumps, what follows the drive, and the colour of the rest: the likeliest ones."""
@@ -242,39 +247,41 @@ class _Seen:
         best, highest = (np.zeros_like(robust), 0.0, colour), score(robust, colour)
         for weight in (WHITE, colour):
             misfit, price = followed(robust, self.columns, weight)
-            item = colour_of(robust - misfit)
-            value = score(robust - misfit, item) - price
+            rest_colour = colour_of(robust - misfit)
+            likelihood = score(robust - misfit, rest_colour) - price
             share = 1.0 - float(np.var(robust - misfit)) / float(np.var(robust))
-            if value > highest + LEAST and share > 0.0:
-                best, highest = (misfit, price, item), value
-            elif share > _MUCH and value > highest - LEAST:
-                best = *best[:2], replace(best[2], told=False)
+            if likelihood > highest + LEAST and share > 0.0:
+                best, highest = (misfit, price, rest_colour), likelihood
+            elif share > _MUCH and likelihood > highest - LEAST:
+                best = *best[:2], replace(best[2], is_clear=False)
         if self.period is not None and best[2] is not WHITE:
             again, cost = returning(robust - best[0], self.index, self.period)
-            item = colour_of(robust - best[0] - again)
-            if score(robust - best[0] - again, item) - best[1] - cost > highest + LEAST:
-                best = best[0] + again, best[1] + cost, item
+            rest_colour = colour_of(robust - best[0] - again)
+            if score(robust - best[0] - again, rest_colour) - best[1] - cost > highest + LEAST:
+                best = best[0] + again, best[1] + cost, rest_colour
         return best
 
-    def _tones(self, left: FloatArray, *, beside: bool) -> tuple[list[NoiseKind], bool, FloatArray]:
+    def _tones(
+        self, left: FloatArray, *, has_misfit: bool
+    ) -> tuple[list[NoiseKind], bool, FloatArray]:
         """Return the lines that are not the drive's, whether some are, and all of them (m,).
 
-        `beside` a misfit only those of the mains are known not to be the drive's.
+        With a misfit, only lines of the mains are certainly not the drive's.
         """
         part = slice(self.index[0], self.index[-1] + 1)
         place = self.index - self.index[0]
         even = np.zeros(int(place[-1]) + 1)
         even[place] = np.where(left == 0.0, 1e-300, left)
-        result, rest = tones_in(even)
+        tones, rest = tones_in(even)
         at, largest = list[float](), 0.0
-        for tone in result:
+        for tone in tones:
             hertz = tone.frequency / self.dt
             of_drive = any(self._of_drive(tone.frequency, u[part]) for u in self.inputs)
-            if not of_drive and (not beside or is_mains(hertz)):
+            if not of_drive and (not has_misfit or is_mains(hertz)):
                 at.append(hertz)
                 largest = max(largest, tone.amplitude)
         kinds = [NoiseKind("lines", {"amplitude": largest}, (*at,))] if at else []
-        return kinds, len(at) < len(result), left - rest[place]
+        return kinds, len(at) < len(tones), left - rest[place]
 
     def _of_drive(self, frequency: float, drive: FloatArray) -> bool:
         """Whether a line may be the drive's: a line of it, or a harmonic of its strongest line."""
@@ -286,10 +293,10 @@ class _Seen:
         first = dominant_line(power)
         if first is None:
             return False
-        item = drive.size / self.period if self.period else centre_of(power, first)
-        wide = min(_SHARP / item, _BROAD) if self.period else _BROAD
-        order = round(place / item)
-        return order <= _HARMONICS and abs(place / item - order) < wide
+        base = drive.size / self.period if self.period else centre_of(power, first)
+        wide = min(_SHARP / base, _BROAD) if self.period else _BROAD
+        order = round(place / base)
+        return order <= _HARMONICS and abs(place / base - order) < wide
 
     @cached_property
     def columns(self) -> FloatArray:
@@ -302,7 +309,7 @@ class _Seen:
         return period_of(self.inputs[0]) if self.inputs and np.ptp(self.inputs[0]) > 0.0 else None
 
     def _is_noise(self, left: FloatArray, misfit: FloatArray) -> bool:
-        """Whether what is coloured cannot be a misfit's form: there is none, or a slight one.
+        """Whether the colour cannot be the form of a misfit: there is none, or a small one.
 
         Or one that is no larger, and whose drive returns, so that what does not is none.
         """
@@ -330,9 +337,9 @@ class _Seen:
         rate, away = np.gradient(values), np.abs(values - 0.5 * (values.min() + values.max()))
         for x in (values, away, rate, np.abs(rate)):
             bins = np.searchsorted(np.quantile(x, np.arange(1, 8) / 8.0), x)
-            each = np.bincount(bins) * (places.size / x.size)
-            item = np.bincount(bins[places], minlength=each.size)
-            apart = (item - each)[each > 0.0] ** 2 / each[each > 0.0]
+            expected = np.bincount(bins) * (places.size / x.size)
+            excess = np.bincount(bins[places], minlength=expected.size) - expected
+            apart = excess[expected > 0.0] ** 2 / expected[expected > 0.0]
             chances.append(scipy.special.chdtrc(max(apart.size - 1, 1), float(apart.sum())))
         return bool(min(chances) < _NO_CHANCE)
 
@@ -341,7 +348,7 @@ class _Seen:
 
         Outliers alone where these are not the `whole` noise.
         """
-        result, tails = list[NoiseKind](), (0.0, 0.0)
+        kinds, tails = list[NoiseKind](), (0.0, 0.0)
         scale = 1.4826 * float(np.median(np.abs(white[white != 0.0])))
         z = white / max(scale, 1e-300)
         if whole:
@@ -349,7 +356,7 @@ class _Seen:
             jitter, grows = (_grown(z, x) for x in (rate, self.predicted[self.index]))
             gain, size, deviation = best = max(jitter, grows, key=lambda g: g[0])
             if gain > LEAST:
-                result.append(
+                kinds.append(
                     NoiseKind("jitter", {"rms": size * scale})
                     if best is jitter
                     else NoiseKind("grows", {"share": size * scale})
@@ -358,21 +365,21 @@ class _Seen:
             tails = _tails(z)
         gain, where = _outliers(z)
         if tails[0] > max(gain, LEAST):
-            return [*result, NoiseKind("heavy_tails", {"freedom": tails[1]})]
+            return [*kinds, NoiseKind("heavy_tails", {"freedom": tails[1]})]
         places = np.flatnonzero(where & spikes)
         if gain < LEAST or not places.size or self._with_drive(places):
-            return result
-        return [*result, NoiseKind("outliers", {"count": float(places.size)}, self._times(places))]
+            return kinds
+        return [*kinds, NoiseKind("outliers", {"count": float(places.size)}, self._times(places))]
 
 
-#: A drive's harmonics up to this one are its own, to this many of the record's resolutions, or to
-#: this share of its frequency where it does not repeat; it moves where it has this share of its
-#: range.
+#: A drive's harmonics up to this one count as the drive, to this many of the record's resolutions,
+#: or to this share of its frequency where it does not repeat; it moves where it has this share of
+#: its range.
 _HARMONICS, _SHARP, _BROAD, _LOUD = 40, 0.75, 0.1, 5e-3
 #: A misfit of this share that is as likely as a colour leaves open which of the two it is.
 _MUCH = 0.2
 #: What is left of a misfit may be its form where it is smaller than this share of it; a misfit of
-#: less than this share of the noise is slight.
+#: less than this share of the noise is small.
 _FORM, _LITTLE = 0.5, 0.3
 #: Fewer places follow nothing; the chance below which they follow the drive; samples about a turn
 #: that are at it, and the share of the range by which a turn comes back.
@@ -380,8 +387,8 @@ _FEW, _NO_CHANCE, _NEAR, _TURN = 2, 1e-3, 3, 0.01
 #: A spectrum that falls faster is a smooth signal's, not a noise's, and so is one of which no more
 #: than this share is new in each sample.
 _SMOOTH, _PREDICTED = 2.1, 0.01
-#: Times the least gain below which the colour beside jumps is that of jumps that were missed.
-_SLIGHT = 5.0
+#: Times the least gain below which the colour of the rest is that of undetected jumps.
+_UNDETECTED = 5.0
 #: Standard errors, and the share of the growth of squares, by which neighbours' products may grow.
 _ERRORS, _NEIGHBOURS = 3.0, 0.2
 #: Degrees of freedom that are tried, and above which tails are a normal distribution's.
@@ -402,7 +409,7 @@ def _grown(z: FloatArray, x: FloatArray) -> tuple[float, float, FloatArray]:
     """Return how the size of innovations (m,) grows with x: variance s^2 (1 + c x^2).
 
     That is what it gains [nats], the size per unit, and the deviation of each sample. Neighbours do
-    not grow alike: what a model misses at a high rate is smooth.
+    not grow together: a misfit at a high rate is smooth.
     """
     power = max(float(np.mean(x**2)), 1e-300)
     size, limited = x**2 / power, np.minimum(z**2, 25.0)
@@ -439,7 +446,7 @@ def _tails(z: FloatArray) -> tuple[float, float]:
 def _outliers(z: FloatArray) -> tuple[float, BoolArray]:
     """Return what outliers among innovations gain [nats], and where they are, (m,).
 
-    A rare part of them with a variance of its own, over one normal distribution.
+    A rare part of them has another variance; compared with one normal distribution.
     """
     where = np.abs(z) > _LARGE * 1.4826 * float(np.median(np.abs(z)))
     if not 0.0 < np.mean(where) <= _RARE:

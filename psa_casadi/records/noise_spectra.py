@@ -5,7 +5,7 @@ Schwarz' criterion for k parameters,
 
     L = -sum_j (ln S_j + I_j / S_j) - k/2 ln n,
 
-and lines, which no smooth spectrum has, are found before. Frequencies are in cycles per sample.
+and lines, which no smooth spectrum has, are removed before. Frequencies are in cycles per sample.
 
 Source: Whittle, Arkiv foer Matematik 2 (1953) 423; Schwarz, Annals of Statistics 6 (1978) 461.
 """
@@ -28,14 +28,14 @@ Family = Literal["white", "autoregressive", "one_over_f"]
 _BINS = 400
 #: Lags of the filter that whitens any spectrum.
 FILTER = 24
-#: A family must gain so many nats over white noise; families nearer than this cannot be told apart.
+#: A family must gain this many nats over white noise; nearer families are indistinguishable.
 LEAST, NEAR = 5.0, 3.0
-#: Rounds in which two parameters of a shape are sought, in so many steps each; each round is within
-#: a step of the one before.
+#: Rounds in which two parameters of a shape are sought, in this many steps each; each round is
+#: within a step of the one before.
 _ROUNDS, _STEPS = 3, 9
 #: Slopes of spectra that are sought; beyond the highest one the signal is smooth.
 _SLOPES = (0.4, 2.6)
-#: What forgets within no less than this part of a signal cannot be told from a walk.
+#: A correlation time beyond this part of a signal is indistinguishable from a random walk.
 _WANDERS = 50
 
 
@@ -44,15 +44,15 @@ class Colour:
     """A spectrum S(f): its family, what it gains over white noise [nats], and its shape.
 
     `figures` are the order and the correlation `time` [samples] of an autoregression, or the slope
-    a of f^-a and the corner [cycles per sample] at which white noise is as large. `told` is False
-    where another family is as likely. `density` gives the shape of S at frequencies (m,).
+    a of f^-a and the corner [cycles per sample] at which white noise is as large. `is_clear` is
+    False if another family is as likely. `density` gives the shape of S at frequencies (m,).
     """
 
     family: Family
     gain: float
     figures: Mapping[str, float]
     density: Callable[[FloatArray], FloatArray]
-    told: bool = True
+    is_clear: bool = True
 
     def whitened(self, signal: FloatArray) -> FloatArray:
         """Return a signal (n,) through the filter of order 24 that makes this noise white."""
@@ -71,8 +71,7 @@ class Colour:
     def covariance(self, n: int) -> FloatArray:
         """Return the shape of the autocovariance (n,) that belongs to the spectrum."""
         shape = self.density(np.maximum(np.arange(n // 2 + 1), 1) / n)
-        values: FloatArray = scipy.fft.irfft(shape, n)
-        return values
+        return np.asarray(scipy.fft.irfft(shape, n))
 
 
 WHITE = Colour("white", 0.0, {}, np.ones_like)
@@ -82,8 +81,7 @@ def straightened(signal: FloatArray) -> FloatArray:
     """Return a signal (n,) without its mean and trend."""
     t = np.linspace(-1.0, 1.0, signal.size)
     centred = signal - np.mean(signal)
-    left: FloatArray = centred - t * (t @ centred) / (t @ t)
-    return left
+    return np.asarray(centred - t * (t @ centred) / (t @ t))
 
 
 def score(signal: FloatArray, colour: Colour) -> float:
@@ -96,19 +94,19 @@ def colour_of(signal: FloatArray) -> Colour:
     """Return the simplest spectrum that explains a signal (n,), by the criterion above.
 
     Families: white; autoregressive of order 1 to 8, or of first order on white noise; f^-a, alone
-    or on white noise. One that cannot be told from the best one of another family is not `told`.
+    or on white noise. `is_clear` is False if the best of another family is as likely.
     """
     flat = straightened(signal)
-    observed = _Periodogram(flat)
-    power = _power(observed)
-    items = [*_autoregressive(observed, flat), _lag(observed), power]
-    best = max(items, key=lambda c: c.gain)
+    periodogram = _Periodogram(flat)
+    power = _power(periodogram)
+    families = [*_autoregressive(periodogram, flat), _lag(periodogram), power]
+    best = max(families, key=lambda c: c.gain)
     if best.gain < LEAST:
         return WHITE
     if best.figures.get("time", 0.0) > flat.size / _WANDERS and power.gain > best.gain - NEAR:
         return power  # what forgets so slowly has a spectrum of f^-2
-    others = [c.gain for c in items if c.family != best.family]
-    return replace(best, told=best.gain - max(others, default=-np.inf) > NEAR)
+    others = [c.gain for c in families if c.family != best.family]
+    return replace(best, is_clear=best.gain - max(others, default=-np.inf) > NEAR)
 
 
 class _Periodogram:
@@ -127,10 +125,9 @@ class _Periodogram:
         lines = float(np.sum(self.count))
         level = (self.power / shape) @ self.count / (self.power @ self.count)
         price = 0.5 * parameters * float(np.log(self.n))
-        values: FloatArray = -np.log(shape) @ self.count - lines * np.log(level) - price
-        return values
+        return np.asarray(-np.log(shape) @ self.count - lines * np.log(level) - price)
 
-    def sought(
+    def likeliest(
         self, shape: Callable[..., FloatArray], *ranges: tuple[float, float]
     ) -> tuple[float, float, float, Callable[[FloatArray], FloatArray]]:
         """Return the two parameters of the likeliest shape in their ranges, its gain, and it."""
@@ -151,20 +148,16 @@ def _autoregressive(periodogram: _Periodogram, flat: FloatArray) -> list[Colour]
 
     def density(f: FloatArray) -> FloatArray:
         turn = np.polyval(np.r_[-a[::-1], 1.0], np.exp(-2j * np.pi * f))
-        values: FloatArray = 1.0 / np.maximum(np.abs(turn) ** 2, 1e-12)
-        return values
+        return np.asarray(1.0 / np.maximum(np.abs(turn) ** 2, 1e-12))
 
     gain = float(periodogram.gain(density(periodogram.frequency), a.size))
-    values = Colour("autoregressive", gain, {}, density)
-    figures = {
-        "order": float(a.size),
-        "time": forgets(values.covariance(periodogram.n)[: periodogram.n // 2]),
-    }
+    colour, n = Colour("autoregressive", gain, {}, density), periodogram.n
+    figures = {"order": float(a.size), "time": forgets(colour.covariance(n)[: n // 2])}
     f = np.linspace(0.5 / flat.size, 0.5, 1024)
     peak = int(np.argmax(density(f)))
     if 0 < peak < f.size - 1:
         figures["peak"] = float(f[peak])
-    return [replace(values, figures=figures)]
+    return [replace(colour, figures=figures)]
 
 
 def _lag(periodogram: _Periodogram) -> Colour:
@@ -173,12 +166,10 @@ def _lag(periodogram: _Periodogram) -> Colour:
     def shape(memory: FloatArray, size: FloatArray, f: FloatArray) -> FloatArray:
         r = np.exp(-np.exp(-memory))
         low = (1.0 - r) ** 2
-        values: FloatArray = 1.0 + np.exp(size) * low / (low + 4.0 * r * np.sin(np.pi * f) ** 2)
-        return values
+        return np.asarray(1.0 + np.exp(size) * low / (low + 4.0 * r * np.sin(np.pi * f) ** 2))
 
-    memory, _, gain, density = periodogram.sought(
-        shape, (-0.7, np.log(periodogram.n / 4.0)), (-3.0, 14.0)
-    )
+    memories = (-0.7, np.log(periodogram.n / 4.0))
+    memory, _, gain, density = periodogram.likeliest(shape, memories, (-3.0, 14.0))
     return Colour("autoregressive", gain, {"order": 1.0, "time": float(np.exp(memory))}, density)
 
 
@@ -186,10 +177,10 @@ def _power(periodogram: _Periodogram) -> Colour:
     """Spectrum 1 + (corner / f)^a; the corner may lie beyond all frequencies."""
 
     def shape(slope: FloatArray, corner: FloatArray, f: FloatArray) -> FloatArray:
-        values: FloatArray = 1.0 + np.exp(slope * (corner - np.log(f)))
-        return values
+        return np.asarray(1.0 + np.exp(slope * (corner - np.log(f))))
 
-    slope, corner, gain, density = periodogram.sought(shape, _SLOPES, (-np.log(periodogram.n), 4.0))
+    corners = (-np.log(periodogram.n), 4.0)
+    slope, corner, gain, density = periodogram.likeliest(shape, _SLOPES, corners)
     pure = float(np.log(0.5)) < corner - 1.0
     gain += 0.5 * float(np.log(periodogram.n)) * pure
     figures = {"slope": slope} if pure else {"slope": slope, "corner": float(np.exp(corner))}
@@ -226,9 +217,9 @@ def tones_in(signal: FloatArray) -> tuple[list[Tone], FloatArray]:
     The strongest is taken off before the next one is sought. Each is fitted by least squares, to
     first order in its frequency.
     """
-    left, result = signal.copy(), list[Tone]()
+    left, tones = signal.copy(), list[Tone]()
     there, t = signal != 0.0, np.linspace(-1.0, 1.0, signal.size)
-    while len(result) < _MOST:
+    while len(tones) < _MOST:
         power, lines = line_spectrum(left)
         if not lines.size:
             break
@@ -238,5 +229,5 @@ def tones_in(signal: FloatArray) -> tuple[list[Tone], FloatArray]:
         columns = np.column_stack([pair, pair * t[:, None]])
         weights = np.linalg.solve(columns.T @ columns, columns.T @ left)
         left = left - columns @ weights
-        result.append(Tone(frequency, float(np.hypot(*weights[:2]))))
-    return result, left
+        tones.append(Tone(frequency, float(np.hypot(*weights[:2]))))
+    return tones, left

@@ -25,7 +25,7 @@ LISTED = 20
 class Located:
     """One column's values, where they stand, and which of them were reported already.
 
-    Value k stands in `place` number `lines[k]` of the file: a "line" of text, a "row" of a table.
+    Value k is in `place` number `lines[k]` of the file: a "line" of text, a "row" of a table.
     """
 
     path: str
@@ -37,8 +37,8 @@ class Located:
 
     def part(self, where: slice) -> "Located":
         """Return some of the values."""
-        table = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
-        return replace(self, **table)
+        parts = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
+        return replace(self, **parts)
 
 
 def check_length(path: str, samples: int, problems: Problems) -> None:
@@ -103,10 +103,10 @@ def check_excitation(column: Located, problems: Problems) -> None:
 def check_finite(column: Located, problems: Problems, *, complete: bool = False) -> None:
     """Demand measured numbers where there are any, in every row if the column is to be `complete`.
 
-    What was reported already is not told again.
+    What was reported already is not reported again.
     """
     values, place = column.values, column.place
-    for at, output in (
+    for at, text in (
         (np.isnan(values) & complete, "found no value, expected a number; fill"),
         (np.isinf(values), "found {}, expected a finite number; correct"),
         (
@@ -118,7 +118,7 @@ def check_finite(column: Located, problems: Problems, *, complete: bool = False)
         for row in rows[:LISTED]:
             problems.add(
                 f"{column.path}: {place} {column.lines[row]}, column '{column.name}':"
-                f" {output.format(f'{values[row]:.6g}')} the cell or remove the {place}."
+                f" {text.format(f'{values[row]:.6g}')} the cell or remove the {place}."
             )
         problems.add_uncounted(max(0, rows.size - LISTED))
 
@@ -174,9 +174,9 @@ class Record(Signals):
 
     Raises:
         InputError: an array is not one-dimensional or its length differs from that of `time`; the
-            time stands still or goes back, or a number is missing, not finite or beyond 1e100.
+            time does not increase, or a number is missing, not finite or beyond 1e100.
 
-    Units that no stack has (micrometres given as metres) are told by `identify` and `diagnose`.
+    `identify` and `diagnose` report units that no stack has (micrometres stated as metres).
     """
 
     columns: Mapping[str, FloatArray] = field(init=False)
@@ -239,13 +239,8 @@ class Record(Signals):
         )
 
     @property
-    def recorded(self) -> Mapping[str, FloatArray]:
-        """The `columns`."""
-        return self.columns
-
-    @property
-    def shown(self) -> str:
-        """The column to show: the displacement, or the voltage where there is none."""
+    def main_column(self) -> str:
+        """The column to plot first: the displacement, or the voltage where there is none."""
         return "voltage" if self.displacement is None else "displacement"
 
     @property

@@ -9,12 +9,12 @@ from psa_casadi.records.noise import lag_products, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.units import BoolArray, FloatArray
 
-#: Voltages are the same to within this share of their range, as the rms of so many neighbours.
+#: Voltages are the same to within this share of their range, as the rms of this many neighbours.
 SAME, NEIGHBOURS = 1e-3, 9
 #: Windows of the voltage that are looked for elsewhere; repeats of each; distances that are used,
 #: and of each the longest runs.
 ANCHORS, NEAREST, DISTANCES, RUNS = 12, 8, 4, 64
-#: A repeat moves over this share of the voltage's range; so many samples are the fewest to use.
+#: A repeat moves over this share of the voltage's range; the fewest samples to use.
 MOVES, FEWEST = 0.1, 50
 #: A hold lasts as long as the record's mean rate would need for this share of the range.
 LASTS, SHORTEST_HOLD = 0.05, 32
@@ -71,14 +71,14 @@ def repetitions(record: Record) -> list[Repetition]:
     if record.n < 2 * FEWEST or not np.ptp(record.voltage) > 0:
         return []
     rows = {lag: _runs(record, lag) for lag in _candidates(record.voltage)}
-    sizes = {lag: sum(r.stop - r.settled for r in result) for lag, result in rows.items()}
+    sizes = {lag: sum(r.stop - r.settled for r in runs) for lag, runs in rows.items()}
     best = max(sizes.values(), default=0)
     good = sorted(lag for lag, size in sizes.items() if size > 0 and size >= 0.5 * best)
     return [r for lag in good[:DISTANCES] for r in rows[lag]]
 
 
 def _candidates(voltage: FloatArray) -> list[int]:
-    """Return the distances at which windows of the voltage are found again.
+    """Return the distances at which windows of the voltage occur again.
 
     The mean square difference of a window and every place, by the fast Fourier transform.
     """
@@ -112,8 +112,7 @@ def _candidates(voltage: FloatArray) -> list[int]:
 def _sums(values: FloatArray, width: int) -> FloatArray:
     """Return the sums of `width` neighbours, shape (n - width + 1,)."""
     total = np.r_[0.0, np.cumsum(values)]
-    sums: FloatArray = total[width:] - total[:-width]
-    return sums
+    return np.asarray(total[width:] - total[:-width])
 
 
 def _runs(record: Record, lag: int) -> list[Repetition]:
@@ -124,7 +123,7 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
     later = record.time[lag:] - record.time[:-lag]
     same &= np.abs(later - np.median(later)) <= 0.25 * record.sample_time
     longest = sorted(runs_of(same), key=lambda run: run[0] - run[1])[:RUNS]
-    items = []
+    runs = []
     for start, stop in sorted(longest):
         if stop - start < FEWEST:
             continue
@@ -135,8 +134,8 @@ def _runs(record: Record, lag: int) -> list[Repetition]:
         settled = start + lead
         moved = float(np.ptp(record.voltage[settled:stop]))
         if stop - settled >= FEWEST and moved >= MOVES * float(np.ptp(record.voltage)):
-            items.append(Repetition(lag, start, settled, min(stop, settled + ENOUGH)))
-    return items
+            runs.append(Repetition(lag, start, settled, min(stop, settled + ENOUGH)))
+    return runs
 
 
 def _same(signal: FloatArray, lag: int) -> BoolArray:
@@ -144,14 +143,13 @@ def _same(signal: FloatArray, lag: int) -> BoolArray:
     square = np.pad((signal[lag:] - signal[:-lag]) ** 2, NEIGHBOURS // 2, mode="edge")
     limit = NEIGHBOURS * (SAME * float(np.ptp(signal))) ** 2
     # rounding of the running sum must not break what is exactly the same
-    same: BoolArray = _sums(square, NEIGHBOURS) <= limit + 1e-12 * float(np.sum(square))
-    return same
+    return np.asarray(_sums(square, NEIGHBOURS) <= limit + 1e-12 * float(np.sum(square)))
 
 
 #: Intervals of the line that follows a slow drift.
 DRIFT_INTERVALS = 32
 _LAGS, _ORDER = 256, 8
-#: The first half of a hold rings where its power is so many times that of the second: white noise
+#: The first half of a hold rings if its power is this many times that of the second: white noise
 #: of 16 samples in each reaches it in 1 of 11 halves, of 64 in 1 of 300.
 _RINGS = 2.0
 
@@ -160,7 +158,7 @@ _RINGS = 2.0
 class MeasuredNoise:
     """Noise of a displacement: standard deviation `level` [m, or counts], colour, and its base.
 
-    `autocovariance` (lags,) [m^2] begins at lag 0. `autoregression` (p,) holds a_1 ... a_p of
+    `autocovariance` (lags,) [m^2] starts at lag 0. `autoregression` (p,) holds a_1 ... a_p of
     e_k = a_1 e_(k-1) + ... + w_k by Yule and Walker, p chosen by Schwarz' criterion, empty if
     white. `samples` is the number of samples it rests on.
     """
@@ -195,17 +193,17 @@ def repeats(record: Record) -> Repeats | None:
     """
     if record.displacement is None:
         return None
-    result = repetitions(record)
-    if not result:
+    plays = repetitions(record)
+    if not plays:
         return None
     pieces = []
-    for r in result:
+    for r in plays:
         first, second = slice(r.settled, r.stop), slice(r.settled + r.lag, r.stop + r.lag)
         change = record.displacement[second] - record.displacement[first]
         apart = record.voltage[second] - record.voltage[first]
         if np.count_nonzero(np.isfinite(change)) >= FEWEST:
             pieces.append(_without_drift(change, apart, r.lag))
-    apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in result}
+    apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in plays}
     noise = _pooled(pieces, 0.5, len(apart_s))
     if noise is None:
         return None
@@ -243,8 +241,7 @@ def _without_creep(t: FloatArray, y: FloatArray) -> FloatArray | None:
         return None
     place = t / t[-1]
     x = np.column_stack([np.ones_like(t), place, place**2, np.log(place)])
-    left: FloatArray = y - x @ np.linalg.lstsq(x[there], y[there])[0]
-    return left
+    return np.asarray(y - x @ np.linalg.lstsq(x[there], y[there])[0])
 
 
 def _without_drift(change: FloatArray, apart: FloatArray, lag: int) -> tuple[FloatArray, int]:

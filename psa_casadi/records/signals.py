@@ -15,7 +15,7 @@ from psa_casadi.units import BoolArray, FloatArray
 
 #: What an input does between two samples.
 Hold = Literal["linear", "zero"]
-#: So many jumps, and such a share of all moves, make a staircase.
+#: Jumps, and their share of all moves, from which on a signal is a staircase.
 _JUMPS, _NEARLY_ALL = 2, 0.8
 
 
@@ -33,7 +33,7 @@ class Signals(Plotted):
     other columns where one that the model has is missing.
 
     Raises:
-        InputError: fewer than eight samples; a time that stands still or goes back; a column of
+        InputError: fewer than eight samples; a time that does not increase; a column of
             another length, or one that holds infinite numbers.
     """
 
@@ -111,8 +111,8 @@ class Signals(Plotted):
         return replace(self, name=name, time=self.time[part], columns=columns)
 
     @property
-    def shown(self) -> str:
-        """The column to show: the last one."""
+    def main_column(self) -> str:
+        """The column to plot first: the last one."""
         return [*self.columns][-1]
 
     def to_frame(self) -> Any:
@@ -127,22 +127,22 @@ def stairs(signals: Signals, names: Iterable[str]) -> tuple[str, ...]:
     two samples close together is none.
     """
     steps = np.diff(signals.time)
-    wide, result = steps > 0.5 * float(np.median(steps)), []
+    wide, staircases = steps > 0.5 * float(np.median(steps)), []
     for name in names:
         moves = np.diff(signals.columns[name]) != 0.0
         alone = (moves & wide)[1:-1] & ~moves[:-2] & ~moves[2:]
         jumps = int(np.count_nonzero(alone))
         if jumps >= _JUMPS and jumps >= _NEARLY_ALL * np.count_nonzero(moves):
-            result.append(name)
-    return tuple(result)
+            staircases.append(name)
+    return tuple(staircases)
 
 
 def in_parts(records: Iterable[Any]) -> list[tuple[str, list[Any]]]:
     """Return the parts of every record (`slice`), each by the name of the whole."""
-    table: dict[tuple[str, str], list[Any]] = {}
+    parts: dict[tuple[str, str], list[Any]] = {}
     for r in records:
-        table.setdefault((r.name.partition("[")[0], r.sha256), []).append(r)
-    return [(name if item[1:] else item[0].name, item) for (name, _), item in table.items()]
+        parts.setdefault((r.name.partition("[")[0], r.sha256), []).append(r)
+    return [(name if slices[1:] else slices[0].name, slices) for (name, _), slices in parts.items()]
 
 
 def frozen(values: npt.ArrayLike) -> FloatArray:

@@ -17,7 +17,7 @@ from psa_casadi.records.suspects import HIDDEN
 from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
-#: told apart at these shares of it, durations by this factor.
+#: distinguished at these shares of it, durations by this factor.
 _TURNS, _SIZES, _FACTOR = 0.01, (0.1, 0.5), 4.0
 _SIZE_WORDS = ("small", "medium", "large")
 
@@ -47,8 +47,8 @@ class Kind(NamedTuple):
 def stretches(record: Record, span: float) -> tuple[tuple[Kind, ...], npt.NDArray[np.intp]]:
     """Return the kinds of stretches of a record, and which of them each sample (n,) belongs to.
 
-    A stretch lasts from one reversal of the voltage to the next; its size is told in shares of the
-    `span` [V]. What is held within it is a kind of its own.
+    A stretch lasts from one reversal of the voltage to the next; its size counts in shares of the
+    `span` [V]. Held voltages within it are a separate kind.
     """
     if not span > 0:
         return (Kind(0, 0, 0),), np.zeros(record.n, dtype=np.intp)
@@ -90,23 +90,23 @@ def counts(records: Sequence[Record], chosen: Sequence[BoolArray], span: float) 
     return {k: n for k, n in table.items() if n}
 
 
-#: An interval is a gap from so many times the intervals beside it on.
+#: An interval is a gap from this many times the neighbouring intervals on.
 _LONG = 10.0
 
 
-_Given = TypeVar("_Given", Record, Signals)
+_Record = TypeVar("_Record", Record, Signals)
 
 
 def without_gaps(
-    records: Iterable[_Given], inputs: Sequence[str] = ("voltage",)
-) -> tuple[list[_Given], list[str]]:
+    records: Iterable[_Record], inputs: Sequence[str] = ("voltage",)
+) -> tuple[list[_Record], list[str]]:
     """Return the records, cut into parts where a gap hides what an input did; and what was cut.
 
-    A part begins as a record does, with a state that nobody knows: what the stack remembers of a
-    gap is not what a straight line of the voltage would have left.
+    A part starts with an unknown state, as a record does: what the stack remembers of a gap is not
+    what a straight line of the voltage would have left.
     """
-    parts: list[_Given] = []
-    items = []
+    parts: list[_Record] = []
+    sentences = []
     for record in records:
         at: tuple[int, ...] = gaps(record, inputs)
         if not at:
@@ -119,18 +119,18 @@ def without_gaps(
             for k in at
         )
         what = f"the {inputs[0]}" if len(inputs) == 1 else "an input"
-        items.append(
+        sentences.append(
             f"{record.name}: no sample for {places}, while {what} moves: what it did there is"
             f" not known, so that the {len(at) + 1} parts count as records of their own."
         )
-    return parts, items
+    return parts, sentences
 
 
 def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tuple[int, ...]:
     """Return the samples after which there is a gap that hides a motion of an input.
 
     It is many times as long as the intervals before and after it, and an input that went on as it
-    did before, or as it does after it, would have missed its other end by more than a share of its
+    did before, or as it does after it, would differ from its other end by more than a share of its
     range. Both parts have samples enough for a record.
     """
     step = np.diff(record.time)
@@ -139,11 +139,11 @@ def gaps(record: Record | Signals, inputs: Sequence[str] = ("voltage",)) -> tupl
     hidden = np.zeros(inner.size, dtype=np.bool_)
     for values in [c for n in inputs if (c := record.column(n)) is not None]:
         change = np.diff(values)
-        items = [
+        bends = [
             np.abs(change[inner] - step[inner] * change[side] / step[side])
             for side in (inner - 1, inner + 1)
         ]
-        hidden |= np.maximum(*items) > HIDDEN * np.ptp(values)
+        hidden |= np.maximum(*bends) > HIDDEN * np.ptp(values)
     numbers: list[int] = []
     for k in inner[(step[inner] > _LONG * around) & hidden].tolist():
         begin = numbers[-1] + 1 if numbers else 0
@@ -167,9 +167,9 @@ class Channel:
     `outputs` are those of the model, in the column's `unit`. With an `offset`, every record has its
     own; with `factors`, every output has one, the same in all records, and the first factor is that
     of `scale`, a parameter of the sensor, where there is one. `level` is the noise level that
-    weights it; the model is taken to be right to the share `straight` of what is shown (of its rms
-    about the offsets; of the range where there are no factors): a smaller error says nothing of a
-    device.
+    weights it; the model is assumed right to the share `straight` of the readings (of their rms
+    about the offsets; of the range where there are no factors): a smaller error is no sign of a
+    defect.
     """
 
     column: str
@@ -193,8 +193,8 @@ class Experiment:
     A record that is held out whole has no used ones: see `judging`. `channels` are the columns that
     are fitted, the first one foremost; the same in all experiments of a fit, whether a record has
     them or not. `noise` is that of every channel over what is usual in all experiments, 1 where
-    nothing else is known. `known_start` says that the state at its start is the declared one,
-    `remarks` what was done to its samples.
+    nothing else is known. `known_start`: the state at its start is the declared one; `remarks`:
+    what was done to its samples.
     """
 
     record: Record
@@ -208,23 +208,22 @@ class Experiment:
 
     @property
     def further(self) -> tuple[Channel, ...]:
-        """The channels beside the first."""
+        """The channels after the first."""
         return self.channels[1:]
 
-    def beside(self, further: Iterable[Channel]) -> "Experiment":
-        """Return the experiment with other channels beside the first."""
+    def with_further(self, further: Iterable[Channel]) -> "Experiment":
+        """Return the experiment with these channels after the first."""
         return replace(self, channels=(self.channels[0], *further))
 
     @property
     def held_out_whole(self) -> bool:
-        """Whether no sample of the record is fitted; what comes before finds where it begins."""
+        """Whether no sample of the record is fitted; the samples before determine its start."""
         return bool(self.held_out.any() and not self.used.any())
 
     @property
     def known(self) -> BoolArray:
         """The samples that are not held out: the used ones, or those that find the beginning."""
-        mask: BoolArray = self.record.mask & ~self.held_out
-        return mask
+        return np.asarray(self.record.mask & ~self.held_out)
 
     @property
     def stop(self) -> int:
@@ -246,10 +245,8 @@ class Experiment:
 
     def at(self, channel: int, samples: BoolArray | None = None) -> BoolArray:
         """Return which of the samples, by default the used ones, have a reading of a channel."""
-        mask: BoolArray = (self.used if samples is None else samples) & np.isfinite(
-            self.measured(channel)
-        )
-        return mask
+        chosen = self.used if samples is None else samples
+        return np.asarray(chosen & np.isfinite(self.measured(channel)))
 
 
 def noise_share(experiments: Sequence[Experiment], channel: int) -> float:
@@ -325,7 +322,7 @@ def _held_out(record: Record, index: IndexArray) -> tuple[int, ...]:
     Of all choices, the one that holds the fewest extremes of voltage and rate out, among the
     samples that have a reading; of these the one with the smallest share of samples whose kind of
     stretch is not fitted, or not held out, which counts half; of these the one nearest to the last
-    of each four. The first block is always fitted: the record's start is found there.
+    of each four. The first block is always fitted: it determines the record's start.
     """
     voltage = record.voltage
     rate = np.r_[0.0, np.diff(voltage) / np.diff(record.time)]
@@ -340,8 +337,8 @@ def _held_out(record: Record, index: IndexArray) -> tuple[int, ...]:
     np.add.at(shares, (which[record.mask], index[record.mask]), 1.0 / max(1, record.mask.sum()))
     near = np.array([[float(k.near(other)) for other in kinds] for k in kinds])
 
-    def missed(choice: tuple[int, ...]) -> int:
-        return sum(result <= set(choice) for result in extremes)
+    def unfitted(choice: tuple[int, ...]) -> int:
+        return sum(blocks <= set(choice) for blocks in extremes)
 
     def unlike(choice: tuple[int, ...]) -> float:
         whole = np.sum(shares, axis=1)
@@ -350,11 +347,11 @@ def _held_out(record: Record, index: IndexArray) -> tuple[int, ...]:
         return round(float(whole @ (unlearnt + 0.5 * unjudged)), 2)
 
     choices = (c for c in product(*groups) if 0 not in c)
-    return min(choices, key=lambda c: (missed(c), unlike(c), -sum(c), c))
+    return min(choices, key=lambda c: (unfitted(c), unlike(c), -sum(c), c))
 
 
 def in_one_order(records: Iterable[Record]) -> list[Record]:
-    """Return the records by sampling interval, length and content, however they are given."""
+    """Return the records ordered by sampling interval, length and content."""
     return sorted(records, key=lambda r: (r.sample_time, r.n, r.sha256, r.name))
 
 
@@ -369,7 +366,7 @@ def divided(records: Sequence[Record], holdout: Sequence[Record]) -> tuple[Exper
 
 
 #: Samples that are fitted of all records together. A fit takes some 0.1 ms and 2 kB for each, a
-#: diagnosis 0.1 ms and 6 kB; with so many the intervals are a few parts in ten thousand, and what
+#: diagnosis 0.1 ms and 6 kB; with this many the intervals are a few parts in ten thousand, and what
 #: the model lacks is larger.
 MOST = 200_000
 #: Parts that stand for one record, and the samples that it may have however many records there are.
@@ -382,8 +379,8 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
     All together have `MOST` samples at most, and every record its fair share of them, at least
     `LEAST`. The parts of a record are of equal length: its beginning, then in turn what shows the
     most kinds of stretch (rises, falls and holds, see `stretches`) and ends of the voltage's range
-    that the parts so far do not, as far from these as it can be. A part begins as a record does,
-    with a state that nobody knows.
+    that the parts so far do not, as far from these as it can be. A part starts with an
+    unknown state, as a record does.
     """
     shares, left = [0] * len(records), MOST
     for done, k in enumerate(sorted(range(len(records)), key=lambda k: records[k].n)):
@@ -396,9 +393,9 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
             result.append(record)
             continue
         length = share // PARTS
-        items = [k * length for k in _chosen(record, length)]
-        result += [record.slice(a, a + length) for a in items]
-        places = ", ".join(f"{record.time[a]:.4g} s" for a in items)
+        starts = [k * length for k in _chosen(record, length)]
+        result += [record.slice(a, a + length) for a in starts]
+        places = ", ".join(f"{record.time[a]:.4g} s" for a in starts)
         lasts = record.time[length] - record.time[0]
         texts.append(
             f"{record.name}: of {record.n} samples {PARTS} parts of {length} are used, which begin"
@@ -413,16 +410,16 @@ def _chosen(record: Record, length: int) -> list[int]:
     """Return which of the parts of a length stand for a record, in the order of time."""
     v, span = record.voltage, float(np.ptp(record.voltage))
     kinds, which = stretches(record, span)
-    displayed = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)  # and the two ends
-    last = len(displayed) * length
+    shows = np.zeros((record.n // length, len(kinds) + 2), dtype=np.bool_)  # and the two ends
+    last = len(shows) * length
     part = np.arange(last) // length
-    displayed[part, which[:last]] = True
-    displayed[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
-    displayed[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
+    shows[part, which[:last]] = True
+    shows[part[v[:last] >= np.max(v) - _REACHED * span], -2] = True
+    shows[part[v[:last] <= np.min(v) + _REACHED * span], -1] = True
     chosen = [0]
     while len(chosen) < PARTS:
-        new = np.sum(displayed & ~np.any(displayed[chosen], axis=0), axis=1)
-        away = np.min(np.abs(np.subtract.outer(np.arange(len(displayed)), chosen)), axis=1)
+        new = np.sum(shows & ~np.any(shows[chosen], axis=0), axis=1)
+        away = np.min(np.abs(np.subtract.outer(np.arange(len(shows)), chosen)), axis=1)
         new[chosen] = -1
         chosen.append(int(np.lexsort((away, new))[-1]))
     return sorted(chosen)

@@ -2,11 +2,19 @@
 
 They are recognised from the record alone and masked; nothing is put in their place. What a stack
 can do (ring after a step, follow a jump of the voltage, turn sharply) is not suspect.
+
+Spikes: a sample of a sampled motion is nearly a fixed linear function of its neighbours and of the
+inputs around it; its coefficients are fitted to the record. A spike of size a at sample m adds a to
+the residual there and -a times the coefficients at its neighbours. In each group of large residuals
+the spikes are added one by one until they explain it (orthogonal matching pursuit). Residuals
+behind jumps of an input are compared with those behind other jumps.
+
+Source: Pati, Rezaiifar and Krishnaprasad, "Orthogonal matching pursuit", Asilomar 1993.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy
@@ -16,12 +24,112 @@ from psa_casadi.records.noise import (
     BLOCK,
     high_frequency_noise,
     last_place_of,
+    local_scale,
     quantum_of,
     runs_of,
 )
 from psa_casadi.records.record import Record
-from psa_casadi.records.spikes import spikes_in
 from psa_casadi.units import BoolArray, FloatArray
+
+#: Neighbours on each side of which a sample is a function, and instants of the inputs around it.
+_REACH, _INPUTS = 4, 1
+#: Rounds in which the function is fitted without what it does not explain; rows for each
+#: coefficient, and standard deviations that are left out of the fit.
+_ROUNDS, _ROWS, _UNUSUAL = 8, 20, 4.0
+#: Times the usual move of an input that make a jump, samples after it that may belong to it, and
+#: times the usual residual of a jump that a spike among them must exceed.
+_JUMP, _AFTER, _OF_JUMPS = 10.0, 16, 8.0
+#: What spikes may leave of the residual around them, over the largest: a kink leaves more.
+_LEFT = 0.1
+
+
+def spikes_in(
+    y: FloatArray, inputs: FloatArray, limit: float, smallest: float, longest: int
+) -> BoolArray:
+    """Return which samples of an output (n,), nan where there is none, are spikes.
+
+    `inputs` (n, nu) are known throughout. A spike has at most `longest` samples and stands out by
+    `limit` standard deviations of the residual around it and by `smallest`, in the output's unit.
+    """
+    mask = np.zeros(y.size, dtype=np.bool_)
+    if np.isfinite(y).sum() < _ROWS:
+        return mask
+    moving = inputs[:, np.ptp(inputs, axis=0) > 0.0]
+    sides = [j for j in range(-_REACH, _REACH + 1) if j]
+    near = [y, *(moving[:, k] for k in range(moving.shape[1]))]
+    near = [(s - np.nanmean(s)) / (np.nanstd(s) or 1.0) for s in near]
+    columns = [np.roll(near[0], -j) for j in sides]
+    columns += [np.roll(u, -j) for u in near[1:] for j in range(-_INPUTS, _INPUTS + 1)]
+    regressors = np.column_stack([*columns, np.ones(y.size)])
+    good = np.isfinite(regressors).all(axis=1) & np.isfinite(y)
+    good[:_REACH] = good[-_REACH:] = False
+    used, unit = good, float(np.nanstd(y)) or 1.0
+    moves = np.abs(np.diff(moving, axis=0, prepend=moving[:1]))
+    sudden = np.any(moves > _JUMP * np.median(moves, axis=0), axis=1)
+    jumps = scipy.ndimage.maximum_filter1d(
+        np.asarray(sudden, dtype=np.bool_), _REACH + _AFTER + 1, origin=(_AFTER - _REACH) // 2
+    )
+    for _ in range(_ROUNDS):
+        if used.sum() < _ROWS * regressors.shape[1]:
+            return mask
+        weights = np.linalg.lstsq(regressors[used], near[0][used], rcond=1e-10)[0]
+        left = np.where(good, near[0] - np.where(good[:, None], regressors, 0.0) @ weights, 0.0)
+        size = np.abs(left)
+        usual = np.full(y.size, 1.4826 * float(np.median(size[good])))
+        if (good & jumps).any():
+            usual[jumps] = max(usual[0], 1.4826 * float(np.median(size[good & jumps])))
+        peak = (size > _UNUSUAL * usual) & (size >= _grown(size))
+        before, used = used, good & ~_grown(peak)
+        if np.array_equal(before, used):
+            break
+    places = np.flatnonzero(used)
+    scale = np.interp(np.arange(y.size), places, local_scale(size[used]))
+    allowed = np.maximum(limit * scale, smallest / unit)
+    if peaks := [float(np.max(size[start:stop])) for start, stop in runs_of(jumps)]:
+        allowed[jumps] = np.maximum(allowed[jumps], _OF_JUMPS * np.median(peaks))
+    pattern = np.ones(2 * _REACH + 1)
+    pattern[[_REACH - j for j in sides]] = -weights[: len(sides)]
+    for start, stop in runs_of(_grown(good & (size > allowed))):
+        place = _pursued(left[start:stop], pattern, allowed[start:stop], limit, longest)
+        mask[start + np.array(place, dtype=np.intp)] = True
+    for start, stop in runs_of(mask):
+        if stop - start > longest:
+            mask[start:stop] = False
+    return mask
+
+
+def _grown(values: Any) -> Any:
+    """Return the largest of each value (n,) and its neighbours within `_REACH`."""
+    return scipy.ndimage.maximum_filter1d(values, 2 * _REACH + 1)
+
+
+def _pursued(
+    left: FloatArray, pattern: FloatArray, allowed: FloatArray, limit: float, longest: int
+) -> list[int]:
+    """Return the places of the fewest spikes that explain a residual (m,); none where none do.
+
+    They are added one by one; else it is one spike of several samples that leaves only noise.
+    """
+    n = left.size
+    each = np.array([np.convolve(np.eye(n)[k], pattern, mode="same") for k in range(n)]).T
+    sizes = np.linalg.norm(each, axis=0)
+
+    def tried(places: list[int], share: float) -> tuple[bool, FloatArray]:
+        weights = np.linalg.lstsq(each[:, places], left, rcond=None)[0]
+        rest = left - each[:, places] @ weights
+        most = np.maximum(_UNUSUAL * allowed / limit, share * float(np.max(np.abs(weights))))
+        large = bool(np.all(np.abs(weights) > allowed[places]))
+        return large and bool(np.all(np.abs(rest) <= most)), rest
+
+    places, rest = list[int](), left
+    while len(places) <= n // _REACH:
+        places.append(int(np.argmax(np.abs(each.T @ rest) / sizes)))
+        is_all, rest = tried(places, _LEFT)
+        if is_all:
+            return places
+    runs = [[*range(k, k + m)] for m in range(2, longest + 1) for k in range(n - m + 1)]
+    return next((run for run in runs if tried(run, 0.0)[0]), [])
+
 
 #: Signals (n,) by their names.
 Columns = Mapping[str, FloatArray]
@@ -30,8 +138,9 @@ Columns = Mapping[str, FloatArray]
 SPIKE, LIMIT = 3, 8.0
 #: Samples before and after a run of equal ones in which the voltage may move the stack.
 BEFORE, AFTER = 4, 24
-#: Equal samples in a row that may be a sensor at rest, and the share of the range it missed.
-EQUAL, MISSED = 8, 0.05
+#: Equal samples in a row that may be a sensor at rest, and the least motion meanwhile, over the
+#: range.
+EQUAL, MOTION = 8, 0.05
 #: Share of fast changes of the voltage without a new reading from which on the stack is late.
 LATE = 0.3
 #: Runs of equal readings that chance may make where the voltage is fast, and that are none then.
@@ -42,7 +151,7 @@ BY_NOISE, RARELY, NO_CHANCE = 2e-3, 0.05, 1e-4
 #: Least noise over the record's range, and least ratio of the fourth to the third differences: that
 #: of white noise is 1.87, that of a motion below a fifth of the sampling rate at most 1.2.
 NOISY, ROUGH = 1e-5, 1.3
-#: Parts of a record's values, by size, in each of which its digits are told.
+#: Parts of a record's values, by size, in each of which its digits are determined.
 BANDS = 4
 
 
@@ -58,7 +167,7 @@ def equal_runs(
     usual = float(np.percentile(lengths, 95))
     slope = span / reach if reach > 0 else 0.0
     swing = slope * np.abs(np.diff(voltage, prepend=voltage[0]))
-    floor = max(20.0 * (quantum or 0.0), MISSED * span)
+    floor = max(20.0 * (quantum or 0.0), MOTION * span)
     for start, stop in zip(starts, stops, strict=True):
         if stop - start <= SPIKE:
             continue
@@ -68,7 +177,7 @@ def equal_runs(
         into, out = sign * before, sign * after  # both positive where it is off to one side
         expected = slope * float(np.ptp(voltage[start:stop]))
         near = swing[max(0, start - AFTER) : stop + BEFORE]
-        off, sudden = max(floor, 3.0 * float(np.max(near))), 0.5 * MISSED * span
+        off, sudden = max(floor, 3.0 * float(np.max(near))), 0.5 * MOTION * span
         returns = abs(into - out) < 0.5 * min(into, out) + 1.5 * expected
         rests = stop - start >= max(EQUAL, 4.0 * usual) and expected > floor
         if (min(into, out) > off and returns) or (rests and abs(into) > sudden):
@@ -86,7 +195,7 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
     share of readings that are repeated, must not be expected where the voltage is fast. Where that
     is how the record answers fast changes in general, the stack is late and no sensor stuck.
     """
-    result = np.zeros(y.size, dtype=np.bool_)
+    mask = np.zeros(y.size, dtype=np.bool_)
     centred = voltage - np.mean(voltage)
     power = float(centred @ centred)
     slope = float(centred @ y) / power if power > 0 else 0.0
@@ -102,15 +211,15 @@ def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> 
         made_up = (y[stop + 1] - y[stop]) * np.sign(misfit)
         expected = abs(slope * (voltage[stop + 1] - voltage[start]))
         if abs(misfit) > least and made_up > max(least, 0.5 * expected):
-            result[start + 1 : stop + 1] = True
+            mask[start + 1 : stop + 1] = True
     late = fast.any() and float(np.mean(same[fast])) > LATE
-    return np.zeros_like(result) if late else result
+    return np.zeros_like(mask) if late else mask
 
 
 def repeated_in_noise(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
     """Return where a reading is the last one to the last digit, which noise hardly ever makes.
 
-    Two readings with noise of standard deviation s are alike to a digit d with a chance of
+    Two readings with noise of standard deviation s agree to a digit d with a chance of
     d / (2 sqrt(pi) s). However slow or late the stack is, a sensor that repeats clearly more than
     that while the voltage changes does not measure; one that repeats often is read more slowly than
     it is sampled.
@@ -162,8 +271,8 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
 
     There the signal has one value, to the last digit, while the voltage moves the stack by what
     other readings show: more than a turn does within the noise. It comes there as the stack moves;
-    what jumps there is a drop-out. Of a signal whose digits hide its noise no end is told, because
-    a drive that is saturated looks the same there.
+    what jumps there is a drop-out. If the digits of a signal hide its noise, it has no flat end,
+    because a drive that is saturated looks the same there.
     """
     span = float(np.ptp(y))
     at = {upper: np.abs(y - (y.max() if upper else y.min())) <= 1e-12 * span for upper in (0, 1)}
@@ -173,19 +282,17 @@ def flat_ends(y: FloatArray, voltage: FloatArray) -> tuple[FlatEnd, ...]:
     if noise <= last_place_of(y):  # digits that are as coarse make a drive's flat top as flat
         return ()
     least = max(HIDDEN * span, LIMIT * noise)
-    items = []
+    ends = []
     for upper, where in at.items():
         if where.sum() < FEWEST:
             continue
         runs = runs_of(where)
-        moved = slope * np.array(
-            [float(np.ptp(voltage[a:b])) * (b - a >= LONGEST) for a, b in runs]
-        )
+        moved = slope * np.array([np.ptp(voltage[a:b]) * (b - a >= LONGEST) for a, b in runs])
         into = np.array([_jump(y, a) - REACHED * slope * _jump(voltage, a) for a, _ in runs])
         jumped = sum(b - a for (a, b), j in zip(runs, into, strict=True) if j > LIMIT * noise)
         if np.max(moved) > least and 2 * jumped < where.sum():
-            items.append(FlatEnd(float(y[where][0]), where, bool(upper)))
-    return tuple(items)
+            ends.append(FlatEnd(float(y[where][0]), where, bool(upper)))
+    return tuple(ends)
 
 
 def _jump(signal: FloatArray, at: int) -> float:
@@ -196,8 +303,8 @@ def _jump(signal: FloatArray, at: int) -> float:
 def _slope(y: FloatArray, voltage: FloatArray, inside: BoolArray) -> float:
     """Return the size of the regression slope of the readings that are at neither end.
 
-    Every run of them has its own centre: between two of them the stack was at its end and has come
-    back on another branch.
+    Every run of them is centred by itself: between two of them the stack was at its end and has
+    come back on another branch.
     """
     if inside.sum() < FEWEST:
         inside = np.ones(y.size, dtype=np.bool_)
@@ -233,14 +340,14 @@ class Suspects:
     names: tuple[str, str, str] = ("the displacement", "the voltage", "the stack")
 
     def notes(self, where: str) -> tuple[Note, ...]:
-        """Return what was found in the column `where`, one note for each kind."""
+        """Return one note for each kind of suspect samples in the column `where`."""
         counts = {kind: n for kind, n in self.counts.items() if n and kind != "saturated"}
-        items = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
-        items += self.saturation(where)
+        notes = [note("masked", where=where, count=n, kind=kind) for kind, n in counts.items()]
+        notes += self.saturation(where)
         if self.quantum is not None:
             step = (self.quantum, self.unit)
-            items.append(note("quantised", where=where, output=self.names[0], step=step))
-        return tuple(items)
+            notes.append(note("quantised", where=where, output=self.names[0], step=step))
+        return tuple(notes)
 
     def saturation(self, where: str) -> tuple[Note, ...]:
         """Return at which values the sensor was saturated, one note for each."""
@@ -273,18 +380,18 @@ def suspects_of(name: str, output: FloatArray, unit: str, inputs: Columns) -> Su
     and where more than half of the samples would be suspect, none is.
     """
     there = np.isfinite(output)
-    table = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
-    drive = max(table, key=lambda n: table[n], default="")
+    correlations = {n: _correlation(u[there], output[there]) for n, u in inputs.items()}
+    drive = max(correlations, key=lambda n: correlations[n], default="")
     moving = inputs.get(drive, np.zeros(output.size))
     equal = bool(there.any()) and _is_noisy(output[there])
-    result = _suspects(output, moving, inputs, unit, equal=equal)
-    if 2 * result.mask.sum() > there.sum():
-        result = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
-    return replace(result, names=(name, drive, name))
+    marked = _suspects(output, moving, inputs, unit, equal=equal)
+    if 2 * marked.mask.sum() > there.sum():
+        marked = Suspects(np.zeros(output.size, dtype=np.bool_), {}, None, unit)
+    return replace(marked, names=(name, drive, name))
 
 
 def _correlation(u: FloatArray, y: FloatArray) -> float:
-    """Return the size of the correlation of two signals (n,), 0 where one stands still."""
+    """Return the size of the correlation of two signals (n,), 0 if one is constant."""
     if not u.size or not np.ptp(u) > 0.0 or not np.ptp(y) > 0.0:
         return 0.0
     return abs(float(np.corrcoef(u, y)[0, 1]))
@@ -314,23 +421,19 @@ def _suspects(
     known = np.full(output.size, np.nan)
     known[rest] = output[rest]
     span = float(np.ptp(output[rest])) if rest.size else 0.0
-    table = np.column_stack([np.empty((output.size, 0)), *inputs.values()])
+    columns = np.column_stack([np.empty((output.size, 0)), *inputs.values()])
     smallest = max(SMALLEST * span, 0.5 * LIMIT * (quantum or 0.0))
-    outlying = spikes_in(known, table, LIMIT, smallest, SPIKE)[valid]
+    outlying = spikes_in(known, columns, LIMIT, smallest, SPIKE)[valid]
     kinds = (outlying, dropped, stuck, flat)
-    for kind, result in zip(counts, kinds, strict=True):
-        counts[kind] = int(result.sum())
-        mask[valid[result]] = True
+    for kind, flags in zip(counts, kinds, strict=True):
+        counts[kind] = int(flags.sum())
+        mask[valid[flags]] = True
     return Suspects(mask, counts, quantum, unit, ends)
 
 
-def cleaned(record: Record) -> Record:
-    """Return the record with suspect samples masked (nan); name and `sha256` are kept."""
-    return masked(record, suspects(record))
-
-
-def masked(record: Record, result: Suspects) -> Record:
-    """Return the record with the samples that were found suspect masked (nan)."""
-    if record.displacement is None or not result.mask.any():
+def cleaned(record: Record, of: Suspects | None = None) -> Record:
+    """Return the record with its suspect samples masked (nan); name and `sha256` are kept."""
+    mask = (of or suspects(record)).mask
+    if record.displacement is None or not mask.any():
         return record
-    return replace(record, displacement=np.where(result.mask, np.nan, record.displacement))
+    return replace(record, displacement=np.where(mask, np.nan, record.displacement))

@@ -11,7 +11,7 @@ from typing import Any
 
 from psa_casadi.characters import plain, visible
 from psa_casadi.errors import InputError
-from psa_casadi.records.read.file_bytes import MOST_BYTES
+from psa_casadi.records.read.table import MOST_BYTES
 from psa_casadi.workbench import run as runs
 from psa_casadi.workbench.previews import Subject, preview
 from psa_casadi.workbench.run import Run, Settings, removed

@@ -20,6 +20,8 @@ from psa_casadi.datasets.fetching import DATA_VARIABLE
 from psa_casadi.errors import InputError, PsaError
 
 TABLE = "".join(f"{k:.6f}\t9.000000\t{k * 1.8:.6f}\t{-0.5 * k:.6f}\r\n" for k in range(40)).encode()
+#: Makes a dataset of a table at an address.
+Publish = Callable[[str, bytes], Dataset]
 PART = Columns(first_row=3, rows=20, voltage=2, displacement=3, sample_rate=200.0)
 
 
@@ -39,9 +41,8 @@ def served(tmp_path: Path) -> Iterator[str]:
         def log_message(self, format: str, *args: object) -> None:
             """Say nothing."""
 
-    server = http.server.ThreadingHTTPServer(
-        ("127.0.0.1", 0), partial(Quiet, directory=str(folder))
-    )
+    handler = partial(Quiet, directory=str(folder))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_address[1]}/table.dat"
     server.shutdown()
@@ -49,8 +50,8 @@ def served(tmp_path: Path) -> Iterator[str]:
 
 
 @pytest.fixture
-def publish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, bytes], Dataset]:
-    """Return what makes a dataset `small` of TABLE, or of what is said to have been published."""
+def publish(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Publish:
+    """Return what makes a dataset `small` of TABLE, or of what is supposed to be published."""
     monkeypatch.delenv(DATA_VARIABLE, raising=False)
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
     for proxy in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
@@ -73,9 +74,7 @@ def sha(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def test_a_table_becomes_a_record(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
-) -> None:
+def test_a_table_becomes_a_record(served: str, publish: Publish, tmp_path: Path) -> None:
     publish(served, TABLE)
     (record,) = datasets.load("small")
     k = np.arange(3, 23)
@@ -89,7 +88,7 @@ def test_a_table_becomes_a_record(
 
 
 def test_another_file_than_the_published_one_is_refused(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
+    served: str, publish: Publish, tmp_path: Path
 ) -> None:
     publish(served, TABLE + b"more")
     with pytest.raises(PsaError, match=r"is not the published file, its SHA-256 differs from"):
@@ -97,21 +96,18 @@ def test_another_file_than_the_published_one_is_refused(
     assert not list((tmp_path / "cache").rglob("*.csv"))
 
 
-def test_no_network_and_no_such_page_are_told_in_a_sentence(
-    served: str, publish: Callable[[str, bytes], Dataset]
-) -> None:
+def test_no_network_and_no_such_page_are_told_in_a_sentence(served: str, publish: Publish) -> None:
     for url in (served.replace("table", "absent"), "http://127.0.0.1:9/table.dat"):
         publish(url, TABLE)
-        with pytest.raises(
-            PsaError, match=r"cannot be downloaded \(\w+\); connect to a network"
-        ) as e:
+        sentence = r"cannot be downloaded \(\w+\); connect to a network"
+        with pytest.raises(PsaError, match=sentence) as e:
             datasets.load("small")
         assert str(e.value).startswith(url)
         assert not isinstance(e.value, InputError)
 
 
 def test_a_folder_is_taken_as_it_is_or_refused(
-    publish: Callable[[str, bytes], Dataset], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    publish: Publish, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     publish("http://127.0.0.1:9/table.dat", TABLE)
     monkeypatch.setenv(DATA_VARIABLE, str(tmp_path))
@@ -124,9 +120,8 @@ def test_a_folder_is_taken_as_it_is_or_refused(
         datasets.load("small")
     path.write_bytes(PART.csv([TABLE]))
     assert datasets.load("small")[0].source == str(path)
-    with pytest.raises(
-        InputError, match=r"table\.dat: there is no such file, .* download http://127"
-    ):
+    sentence = r"table\.dat: there is no such file, .* download http://127"
+    with pytest.raises(InputError, match=sentence):
         datasets.originals("small")
     (path.parent / "table.dat").write_bytes(TABLE)
     assert list(datasets.originals("small")) == ["table.dat"]
@@ -149,9 +144,7 @@ def test_every_dataset_says_what_it_is(dataset: Dataset) -> None:
             assert original.url in text
 
 
-def test_the_command_lists_shows_and_writes(
-    served: str, publish: Callable[[str, bytes], Dataset], tmp_path: Path
-) -> None:
+def test_the_command_lists_shows_and_writes(served: str, publish: Publish, tmp_path: Path) -> None:
     dataset = publish(served, TABLE)
     assert "micromanipulator" in psa()[1]
     assert psa("-q")[1].split() == list(DATASETS)

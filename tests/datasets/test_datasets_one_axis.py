@@ -79,10 +79,8 @@ def test_a_bend_of_the_own_answer_stays(axis: int) -> None:
 
 def test_a_test_signal_is_judged_by_the_response_of_the_training_signals() -> None:
     train, test = voltages(1, 6), voltages(2, 3)
-    csv = OneAxis(1, 1, 2, 2, RATE).csv(
-        [saved(a) for a in (train, driven(train), test, driven(test))]
-    )
-    t, v, x = columns(csv).T
+    arrays = (train, driven(train), test, driven(test))
+    t, v, x = columns(OneAxis(1, 1, 2, 2, RATE).csv([*map(saved, arrays)])).T
     assert len(t) == 2 * N
     np.testing.assert_allclose(v, np.tile(test[:, 1, 2, 0], 2), atol=6e-7)
     item = 1e6 * driven(test, 1)[:, 1, 2]

@@ -122,7 +122,7 @@ def test_the_frozen_function_has_the_gradient_of_the_value(kind: Kind, which: st
         criterion = Information(rivals()[1], ("k_L", "A"), optimality, [colour])
     wave = draw(kind, LIMITS, np.inf, np.random.default_rng(5))
     time = LIMITS.grid()
-    step = 6e-3 if which == "separation" else 3e-3  # above the jumps of the stepper's own steps
+    step = 6e-3 if which == "separation" else 3e-3  # above the jumps of the stepper's steps
     rng = np.random.default_rng(1)
     way = rng.standard_normal(len(wave.start)) / np.sqrt(len(wave.start))
     if kind == "steps":  # an edge that moves over a sample makes a kink: change the levels only

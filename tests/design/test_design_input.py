@@ -156,10 +156,8 @@ def test_mistakes_are_told_together(tmp_path: Path) -> None:
 def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
     psa.save_model(scanner(), tmp_path / "m.json")
     path, out = a_scan(), tmp_path / "v.csv"
-    psa.write_record(
-        tmp_path / "p.csv",
-        {"time [s]": path.time, "displacement [um]": 1e6 * path.displacement},
-    )
+    um = 1e6 * path.displacement
+    psa.write_record(tmp_path / "p.csv", {"time [s]": path.time, "displacement [um]": um})
     arguments = ["design", "input", "--model", str(tmp_path / "m.json"), "-o", str(out)]
     more = ["--target", str(tmp_path / "p.csv"), "--report", str(tmp_path / "r.html"), "--still"]
     ended = done(*arguments, *more)
@@ -176,7 +174,7 @@ def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
 
 
 def test_a_path_beyond_the_voltage_is_followed_to_the_limit_and_says_so() -> None:
-    """A peak that is cut by 10 %: what is left of the error stands where the limit does."""
+    """A peak that is cut by 10 %: the remaining error is where the limit is."""
     need = float(invert(scanner(), a_scan()).response.voltage.max())
     limits = AmplifierLimits(max_voltage=0.9 * need)
     result = invert(scanner(), a_scan(), limits).response

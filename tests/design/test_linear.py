@@ -90,7 +90,7 @@ def test_margins_are_those_of_a_known_loop() -> None:
 
 
 def test_an_observer_follows_what_is_not_measured(tmp_path: Path) -> None:
-    """Its filter in an FMU, beside the plant with noise; white noise of known size comes down."""
+    """Its filter in an FMU, with a plant with noise; white noise of known size comes down."""
     rng, n, step = np.random.default_rng(2), 20_000, 1e-3
     t = step * np.arange(n, dtype=float)
     force = 0.5 * rng.standard_normal(n)

@@ -247,10 +247,8 @@ def record() -> Drive:
 
 def test_recursion_is_recursive_least_squares_on_the_prediction() -> None:
     """The streaming object does what matrices and finite differences in NumPy do."""
-    values = dict(
-        psa.identifier_for(off_values(psa.stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE).values
-    )
-    d = record()
+    model = off_values(psa.stack_model(STACK), 0.1, 0)
+    values, d = dict(psa.identifier_for(model, PERIOD, noise=NOISE).values), record()
     online = psa.OnlineIdentification(values)
     expected, rows = NumpyIdentification(values), []
     for u, x in zip(d.voltage.tolist(), d.displacement.tolist(), strict=True):
@@ -300,7 +298,7 @@ def test_fmu_gives_what_the_stream_gives(fmi: int, tmp_path: Path) -> None:
 
 
 def test_modelica_block_gives_what_the_stream_gives() -> None:
-    """Another compiler runs the exported block on a drive of its own."""
+    """Another compiler runs the exported block on another drive."""
     model = psa.identifier_for(off_values(psa.stack_model(STACK), 0.1, 0), PERIOD, noise=NOISE)
     wave = "60*(1 - cos(62.83185307179586*({})))"
     harness = f"""

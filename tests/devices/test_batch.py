@@ -87,8 +87,8 @@ def test_few_are_submitted_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyP
     pending: set[Future[Any]] = set()
 
     class Counting(ThreadPoolExecutor):
-        def submit(self, *given: Any, **more: Any) -> Future[Any]:
-            future = super().submit(*given, **more)
+        def submit(self, *task: Any, **more: Any) -> Future[Any]:
+            future = super().submit(*task, **more)
             pending.add(future)
             held.append(len(pending))
             return future
@@ -177,7 +177,7 @@ def test_what_failed_is_tried_again_and_what_was_refused_is_not(
     assert sorted(texts) == ["d0", "d1", "d1", "d2"]
 
 
-def found(task: DeviceTask) -> DeviceOutcome:
+def identified(task: DeviceTask) -> DeviceOutcome:
     text = json_text(identification_file(identification()))
     return DeviceOutcome(task.job.device, "done", 0.0, files=(("identification.json", text),))
 
@@ -187,7 +187,7 @@ def found(task: DeviceTask) -> DeviceOutcome:
 def test_a_damaged_result_is_named_and_made_again(
     name: str, length: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, observed = tmp_path / "out", stand_in(monkeypatch, found)
+    out, observed = tmp_path / "out", stand_in(monkeypatch, identified)
     jobs = [t.job for t in tasks(tmp_path, 5)]
     with ThreadPoolExecutor(1) as pool:
         assert len(psa.batch(jobs, out, executor=pool).findings) == 5
@@ -220,7 +220,7 @@ def test_a_table_of_jobs_is_read(records: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "told"),
+    ("table", "problem"),
     [
         ("name,files\na,b\n", "has the columns device, batch, date, files"),
         ("device\n../up\n", "no folder can have this name"),
@@ -234,11 +234,11 @@ def test_a_table_of_jobs_is_read(records: Path) -> None:
         ("device\nfourth\n", "has no records"),
     ],
 )
-def test_mistakes_in_a_table_are_told(table: str, told: str, records: Path) -> None:
+def test_mistakes_in_a_table_are_reported(table: str, problem: str, records: Path) -> None:
     (records / "jobs.csv").write_text(table)
     with pytest.raises(psa.InputError) as error:
         jobs_given(records / "jobs.csv")
-    assert told in str(error.value)
+    assert problem in str(error.value)
 
 
 def test_an_executor_that_takes_no_more_is_told(tmp_path: Path) -> None:
@@ -255,9 +255,9 @@ def test_an_executor_that_is_lost_is_no_result_of_a_device(
     jobs = [t.job for t in tasks(tmp_path, 3)]
 
     class Lost(ThreadPoolExecutor):
-        def submit(self, *given: Any, **more: Any) -> Future[Any]:
-            if given[1].job.device == "d0":
-                return super().submit(*given, **more)
+        def submit(self, *task: Any, **more: Any) -> Future[Any]:
+            if task[1].job.device == "d0":
+                return super().submit(*task, **more)
             future: Future[Any] = Future()
             future.cancel()  # as a client of Dask does when its scheduler is gone
             future.set_running_or_notify_cancel()
@@ -302,7 +302,7 @@ def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
         table = {}
         for task, outcome in outcomes(items, processes, 1):
             table[task.job.device] = outcome
-            if task.job.device == "d0":  # the next begins with a process that is dying
+            if task.job.device == "d0":  # the next starts with a process that is dying
                 (child,) = children._CHILDREN
                 os.kill(child.pid, signal.SIGKILL)
     finally:

@@ -1,4 +1,4 @@
-"""Many devices that are no stacks: a model of one's own, fitted to the records of each."""
+"""Many devices that are no stacks: another model, fitted to the records of each."""
 
 import json
 from pathlib import Path

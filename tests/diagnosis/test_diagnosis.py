@@ -5,7 +5,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.held_out import gain_of, lost_elsewhere
-from psa_casadi.records.drive import tells_tone
+from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -24,13 +24,13 @@ def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> No
         Record(name="triangle", time=time, voltage=np.arcsin(np.sin(2.0 * np.pi * f * time)))
         for f in (4.0, 5.0)
     )
-    assert tells_tone(49.97, triangle, hum=True)
-    assert not tells_tone(49.97, triangle, hum=False)
-    assert not tells_tone(47.0, triangle, hum=True)
-    assert not tells_tone(49.97, fifth, hum=True)  # the drive's tenth harmonic
-    assert tells_tone(60.02, triangle, hum=False)  # above its twelfth
+    assert is_tone_separable(49.97, triangle, hum=True)
+    assert not is_tone_separable(49.97, triangle, hum=False)
+    assert not is_tone_separable(47.0, triangle, hum=True)
+    assert not is_tone_separable(49.97, fifth, hum=True)  # the drive's tenth harmonic
+    assert is_tone_separable(60.02, triangle, hum=False)  # above its twelfth
     noise = Record(name="noise", time=time, voltage=np.random.default_rng(0).standard_normal(5000))
-    assert tells_tone(60.02, noise, hum=False)
+    assert is_tone_separable(60.02, noise, hum=False)
 
 
 def test_gain_is_the_reduction_of_the_held_out_rms() -> None:

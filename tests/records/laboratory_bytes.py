@@ -75,7 +75,7 @@ def hdf5(
 ) -> bytes:
     """Return an HDF5 file of datasets by their places, with `units` and the file's attributes.
 
-    With a `userblock_size` [bytes] it begins as a MATLAB file of version 7.3 does.
+    With a `userblock_size` [bytes] it starts as a MATLAB file of version 7.3 does.
     """
     stream = io.BytesIO()
     with h5py.File(stream, "w", userblock_size=userblock_size) as file:

@@ -1,4 +1,4 @@
-"""Records in files, what is read of them, and what is said of those that are not read."""
+"""Records in files, what is read of them, and the messages on those that are not read."""
 
 import re
 import shlex
@@ -50,17 +50,15 @@ def assert_is(
     record: Record, t: ArrayLike, v: ArrayLike, x: ArrayLike | None, accuracy: float = 1e-12
 ) -> None:
     """Demand the columns of a record in SI units; its time may begin anywhere."""
-    begin = np.asarray(t, float)
-    np.testing.assert_allclose(
-        record.time - record.time[0], begin - begin[0], rtol=1e-9, atol=1e-12
-    )
+    instants, time = np.asarray(t, float), record.time
+    np.testing.assert_allclose(time - time[0], instants - instants[0], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(record.voltage, np.asarray(v, float), rtol=accuracy)
     moved = np.asarray(record.displacement, float)
     np.testing.assert_allclose(moved, np.asarray(x, float), rtol=accuracy)
 
 
 def problems_of(path: Path, **options: Any) -> tuple[str, ...]:
-    """Return the sentences with which a file is refused; each begins with its name."""
+    """Return the sentences with which a file is refused; each starts with its name."""
     with pytest.raises(InputError) as caught:
         read_record(path, **options)
     begin = (*str(path).split("+"), str(path), "--columns", "... and")
@@ -69,7 +67,7 @@ def problems_of(path: Path, **options: Any) -> tuple[str, ...]:
 
 
 def refused(path: Path, **options: Any) -> str:
-    """Return what is said of a file that is refused."""
+    """Return the message on a file that is refused."""
     return "\n".join(problems_of(path, **options))
 
 

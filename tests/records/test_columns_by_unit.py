@@ -1,4 +1,4 @@
-"""Columns that a person sees at once: told by their units, and never against what a name says."""
+"""Columns that a person recognises: by their units, and never against their names."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -42,7 +42,7 @@ def suggestion(path: Path) -> str:
         (["T (s),U (V),x (um)"], (1.0, 1.0, 1e-6)),
     ],
 )
-def test_units_tell_what_is_what(
+def test_columns_are_recognised_by_their_units(
     head: list[str], sizes: tuple[float, float, float], tmp_path: Path
 ) -> None:
     is_read(read_record(table(tmp_path / "a.csv", *head)), *sizes)
@@ -99,7 +99,7 @@ def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
 
 
 @pytest.mark.parametrize(
-    ("head", "told"),
+    ("head", "problem"),
     [
         ("t (s),Drive Monitor (V),Probe (um)", "column 'voltage' is missing"),
         ("t (s),Position sensor (V),Probe (um)", "column 'voltage' is missing"),
@@ -108,9 +108,9 @@ def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
         ("V/um,t/s,x/um", "column 'voltage' is missing"),
     ],
 )
-def test_nothing_is_suggested_that_is_not_meant(head: str, told: str, tmp_path: Path) -> None:
+def test_nothing_is_suggested_that_is_not_meant(head: str, problem: str, tmp_path: Path) -> None:
     statement = refused(table(tmp_path / "a.csv", head))
-    assert told in statement
+    assert problem in statement
     assert "--columns" not in statement
 
 

@@ -15,7 +15,8 @@ from pyarrow import parquet
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
-from psa_casadi.records.read import apart, file_bytes
+from psa_casadi.records.read import apart
+from psa_casadi.records.read import table as tables
 from psa_casadi.records.read.formats import READERS
 from psa_casadi.records.read.samples import Request
 from tests.mutations import sentences
@@ -41,7 +42,7 @@ def columns(path: Path, **form: Any) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.skipif(os.name != "posix", reason="a script stands in for the interpreter")
+@pytest.mark.skipif(os.name != "posix", reason="a script replaces the interpreter")
 @pytest.mark.parametrize("way", ["kill -SEGV $$", "exit 3", "sleep 60"])
 def test_a_library_that_crashes_or_never_ends_is_a_damaged_file(
     way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -56,19 +57,15 @@ def test_a_library_that_crashes_or_never_ends_is_a_damaged_file(
 
 def bomb(part: str, before: bytes, filler: bytes) -> bytes:
     """Return a workbook with a filler in a part of it, before some text."""
-    content, stream = (
-        xlsx([["t [s]", "V [V]", "x [um]"], *([float(t)] * 3 for t in T)]),
-        io.BytesIO(),
-    )
+    content = xlsx([["t [s]", "V [V]", "x [um]"], *([float(t)] * 3 for t in T)])
+    stream = io.BytesIO()
     with (
         zipfile.ZipFile(io.BytesIO(content)) as archive,
         zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as packed,
     ):
         for name in archive.namelist():
-            item = archive.read(name)
-            packed.writestr(
-                name, item.replace(before, filler + before, 1) if part in name else item
-            )
+            xml = archive.read(name)
+            packed.writestr(name, xml.replace(before, filler + before, part in name))
     return stream.getvalue()
 
 
@@ -87,9 +84,8 @@ def test_small_workbooks_that_unpack_to_much_are_read(kind: str, tmp_path: Path)
 
 
 def test_what_needs_more_memory_than_its_size_may_is_refused(tmp_path: Path) -> None:
-    content = bomb(
-        "worksheets/sheet", b"</sheetData>", b'<row r="9"><c r="XFD1048576"><v>1</v></c></row>'
-    )
+    far = b'<row r="9"><c r="XFD1048576"><v>1</v></c></row>'
+    content = bomb("worksheets/sheet", b"</sheetData>", far)
     assert "needs more memory" in refusal(tmp_path / "a.xlsx", content)
 
 
@@ -100,26 +96,22 @@ def test_arrays_hold_what_they_state(tmp_path: Path) -> None:
     path, count = tmp_path / "a.tdms", (24).to_bytes(8, "little")
     content = tdms({"time": T, "voltage": T}, {})
     assert content.count(count) == 2
-    assert "is no readable TDMS file" in refusal(
-        path, content.replace(count, (2**40).to_bytes(8, "little"))
-    )
+    stated = content.replace(count, (2**40).to_bytes(8, "little"))
+    assert "is no readable TDMS file" in refusal(path, stated)
 
 
 def here(path: Path) -> tuple[str, ...]:
     """Read a file in this process, and return what is wrong with it."""
     request = Request(needed=("voltage",))
-    return apart.answered(apart.Asked(str(path), request, str(path.parent))).outcome.problems
+    return apart.read_here(apart.FileTask(str(path), request, str(path.parent))).problems
 
 
 def test_no_more_is_read_than_a_record_may_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_bytes, "MOST_BYTES", 10_000)
-    whole = {
-        "a.npz": npz({"time": np.zeros(2000)}),
-        "a.h5": hdf5({"time": np.zeros((2, 2000))}, {}),
-    }
-    for name, content in whole.items():
+    monkeypatch.setattr(tables, "MOST_BYTES", 10_000)
+    arrays = hdf5({"time": np.zeros((2, 2000))}, {})
+    for name, content in (("a.npz", npz({"time": np.zeros(2000)})), ("a.h5", arrays)):
         (tmp_path / name).write_bytes(content)
         assert "its arrays hold more than" in here(tmp_path / name)[0]
     zeros = {name: np.zeros(2000) for name in NAMES}
@@ -169,7 +161,7 @@ def test_links_of_hdf5_are_not_followed(suffix: str, tmp_path: Path) -> None:
 def test_a_wrong_size_in_the_statements_on_a_column_does_not_end_this_process(
     tmp_path: Path,
 ) -> None:
-    """What pyarrow 26.0.1 says of a column ends the process where its histogram is damaged."""
+    """A damaged histogram of a column's statistics ends the process of pyarrow 26.0.1."""
     path = tmp_path / "a.parquet"
     whole = columns(path)
     place = whole.index(b"displacement [um]")

@@ -40,9 +40,8 @@ def curve(u: FloatArray) -> FloatArray:
 
 def loop(t: FloatArray = T, seed: int = 1, noise: float = NOISE) -> Record:
     u = sine(t, 0.0, 100.0, 0.05)
-    return Record(
-        name="loop", time=t, voltage=u, displacement=curve(u) + noise * white(seed, t.size)
-    )
+    y = curve(u) + noise * white(seed, t.size)
+    return Record(name="loop", time=t, voltage=u, displacement=y)
 
 
 def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
@@ -50,18 +49,17 @@ def test_a_million_slow_samples_shrink_and_keep_their_content() -> None:
     small, q = decimated(record, NOISE, SLOPE)
     assert 32 <= q <= 500
     assert (record.n, small.n) == (1_000_000, 1_000_000 // q)
-    np.testing.assert_allclose(
-        small.time, np.mean(record.time[: small.n * q].reshape(-1, q), axis=1)
-    )
+    middles = np.mean(record.time[: small.n * q].reshape(-1, q), axis=1)
+    np.testing.assert_allclose(small.time, middles)
     exact = sine(small.time, 0.0, 100.0, 0.05)
     residual = np.asarray(small.displacement) - curve(exact)
     assert np.std(residual) == pytest.approx(NOISE / np.sqrt(q), rel=0.05)
     assert abs(np.mean(residual)) < 4 * NOISE / np.sqrt(record.n)
     assert np.max(np.abs(small.voltage - exact)) < 0.1 * NOISE / SLOPE
-    item = np.polyfit(small.voltage, np.asarray(small.displacement), 2)
+    short = np.polyfit(small.voltage, np.asarray(small.displacement), 2)
     full = np.polyfit(record.voltage, np.asarray(record.displacement), 2)
     spread = NOISE / np.sqrt(record.n) / np.array([30.0**2, 30.0, 1.0])
-    assert np.all(np.abs(item - full) < 3 * spread)
+    assert np.all(np.abs(short - full) < 3 * spread)
     assert (small.name, small.source, small.sha256) == (record.name, record.source, record.sha256)
 
 
@@ -79,10 +77,8 @@ def test_a_ringing_step_is_not_touched() -> None:
 @pytest.mark.parametrize("frequency", [1234.5, 100.0, 3700.0])
 def test_a_tone_below_the_noise_is_kept(frequency: float) -> None:
     base = loop()
-    tone = 0.05 * NOISE * np.sin(2 * np.pi * frequency * T)
-    small, q = decimated(
-        replace(base, displacement=np.array(base.displacement) + tone), NOISE, SLOPE
-    )
+    y = np.array(base.displacement) + 0.05 * NOISE * np.sin(2 * np.pi * frequency * T)
+    small, q = decimated(replace(base, displacement=y), NOISE, SLOPE)
     assert frequency < 0.5 / small.sample_time
     assert q < decimated(base, NOISE, SLOPE)[1]
 
@@ -106,9 +102,8 @@ def test_missing_samples_move_nothing_and_stay_missing() -> None:
     inside = (small.time > T[100_000] + q * 1e-4) & (small.time < T[110_000] - q * 1e-4)
     assert not small.mask[inside].any()
     assert small.mask[~inside].mean() > 0.99
-    residual = (np.asarray(small.displacement) - curve(sine(small.time, 0.0, 100.0, 0.05)))[
-        small.mask
-    ]
+    exact = curve(sine(small.time, 0.0, 100.0, 0.05))
+    residual = (np.asarray(small.displacement) - exact)[small.mask]
     assert abs(np.mean(residual)) < 4 * NOISE / np.sqrt(0.8 * N)
     assert np.std(residual) == pytest.approx(NOISE / np.sqrt(0.8 * q), rel=0.1)
 

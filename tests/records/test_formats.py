@@ -107,9 +107,8 @@ def test_parquet_columns_are_named_as_in_a_csv_header(tmp_path: Path) -> None:
 
 
 def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
-    path = write(
-        tmp_path / "a.csv", "t [ms],amp out,LVDT [um],voltage [V]", *(f"{r},9" for r in ROWS)
-    )
+    header = "t [ms],amp out,LVDT [um],voltage [V]"
+    path = write(tmp_path / "a.csv", header, *(f"{r},9" for r in ROWS))
     record = read_record(path, columns="time=t,voltage=amp out:mV,displacement=lvdt:µm")
     plain = read_record(write(tmp_path / "b.csv", HEADER, *ROWS))
     assert_is(record, plain.time / 1e3, plain.voltage / 1e3, plain.displacement)

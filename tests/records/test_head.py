@@ -82,11 +82,9 @@ def test_workbooks_and_parquet_files_have_the_same_head(tmp_path: Path) -> None:
 
 
 def test_the_head_of_one_of_several_tables(tmp_path: Path) -> None:
-    path, two = (
-        table(tmp_path / "a.csv", "time [s],U [V],x [um]"),
-        "Clock [ms],Drive [V],Probe [nm]",
-    )
-    path.write_text("\n".join([path.read_text(), "run 2", two, *ROWS, ""]))
+    path = table(tmp_path / "a.csv", "time [s],U [V],x [um]")
+    second = ["run 2", "Clock [ms],Drive [V],Probe [nm]", *ROWS, ""]
+    path.write_text("\n".join([path.read_text(), *second]))
     assert head_of(path).tables == ("1", "2")
     assert head_of(path).names == ("time", "U", "x")
     assert head_of(path, table="2").units == ("ms", "V", "nm")

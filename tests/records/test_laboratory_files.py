@@ -1,4 +1,4 @@
-"""One record in the forms that laboratories keep it in: read as it is, or told what to type."""
+"""One record in the forms of laboratories: read as it is, or with a message on what to type."""
 
 import gzip
 import re
@@ -20,17 +20,16 @@ ROWS: list[list[float]] = TABLE.tolist()
 NAMED = {"time": T, "voltage": V, "displacement_um": X}
 VX = {"Voltage": V, "Position": X}
 STATED = {"Voltage": {"unit_string": "V"}, "Position": {"unit_string": "um"}}
-WAVES = {
-    name: {**unit, "wf_increment": 1e-3, "wf_start_offset": 0.0} for name, unit in STATED.items()
-}
+WAVE = {"wf_increment": 1e-3, "wf_start_offset": 0.0}
+WAVES = {name: {**unit, **WAVE} for name, unit in STATED.items()}
 H5_UNITS = {"run/t": "s", "run/drive voltage": "V", "run/sensor position": "um"}
 H5 = dict(zip(H5_UNITS, (T, V, X), strict=True))
 VX_ROWS = [row[1:] for row in ROWS]
 FIELDS = named(T, V, X)
 
-#: Files that are read as they are, by what they are; the name says the ending.
+#: Files that are read as they are, by what they are; the name implies the ending.
 READ: dict[str, str | bytes] = {
-    "own names": text("time [s],voltage [V],displacement [um]"),
+    "canonical names": text("time [s],voltage [V],displacement [um]"),
     "symbols with units": text("t [s],V [V],x [um]"),
     "round brackets": text("Time (s),Voltage (V),Displacement (um)"),
     "micro sign": text("Time (s),Voltage (V),Displacement (µm)"),
@@ -157,7 +156,7 @@ def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("head", "given", "line"),
+    ("head", "columns", "line"),
     [
         ("t,V,x", None, "time=t:s,voltage=V:V,displacement=x:um"),
         ("time [s],V,x", None, "voltage=V:V,displacement=x:um"),
@@ -166,11 +165,11 @@ def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: 
     ],
 )
 def test_the_line_to_type_is_told_once_and_works(
-    head: str, given: str | None, line: str, tmp_path: Path
+    head: str, columns: str | None, line: str, tmp_path: Path
 ) -> None:
     time = 1e3 * T if ":ms" in line else T
     path = kept(tmp_path, "a", text(head, columns=(time, V, X)))
-    (problem,) = problems_of(path, columns=given)
+    (problem,) = problems_of(path, columns=columns)
     assert offered(problem) == {"columns": line}
     assert_read(path, columns=line)
 

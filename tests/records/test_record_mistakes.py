@@ -5,7 +5,7 @@ import pytest
 
 from psa_casadi.errors import InputError
 from psa_casadi.records import read_record
-from psa_casadi.records.read import file_bytes
+from psa_casadi.records.read import table
 from tests.records.record_files import HEADER, ROWS, problems_of, write
 
 
@@ -95,19 +95,19 @@ def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("order", "told"),
+    ("order", "problem"),
     [
         ([k for n in range(30) for k in (n, n)], "their time stands still; remove repeated lines"),
         (range(30)[::-1], "the lines are not in the order of time; sort them by it"),
     ],
 )
 def test_many_lines_out_of_order_are_told_in_one_sentence(
-    order: Sequence[int], told: str, tmp_path: Path
+    order: Sequence[int], problem: str, tmp_path: Path
 ) -> None:
     lines = [f"{k / 1000},{k % 7},{k % 7 / 10}" for k in order]
-    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *lines))
-    assert "are not later than the one before, line" in problem
-    assert told in problem
+    (sentence,) = problems_of(write(tmp_path / "a.csv", HEADER, *lines))
+    assert "are not later than the one before, line" in sentence
+    assert problem in sentence
 
 
 @pytest.mark.parametrize("row", ["inf,nan,1", "a,b,c"])
@@ -131,7 +131,7 @@ def test_instants_that_are_one_in_seconds_are_refused(tmp_path: Path) -> None:
 def test_lines_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "a.csv", HEADER, *ROWS, *[""] * 1000)
     assert read_record(path).n == 20
-    monkeypatch.setattr(file_bytes, "MOST_BYTES", 10_000)
+    monkeypatch.setattr(table, "MOST_BYTES", 10_000)
     (problem,) = problems_of(path)
     assert "its lines need more than" in problem
 

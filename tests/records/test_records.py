@@ -56,12 +56,8 @@ def test_a_million_rows_are_read_quickly(tmp_path: Path) -> None:
 
 def make_record() -> Record:
     time = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
-    return Record(
-        name="r",
-        time=time,
-        voltage=2 * time,
-        displacement=np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6,
-    )
+    displacement = np.array([1.0, np.nan, 3.0, -1.0, 0.0]) * 1e-6
+    return Record(name="r", time=time, voltage=2 * time, displacement=displacement)
 
 
 def test_records_made_in_memory_are_told_apart_by_their_hash() -> None:

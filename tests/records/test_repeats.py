@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation
-from psa_casadi.records.repeats import held, holds, repeats, repetitions
+from psa_casadi.records.repeats import MeasuredNoise, held, holds, repeats, repetitions
 from psa_casadi.units import FloatArray
 
 LEVEL = 1e-8
@@ -31,14 +31,12 @@ def record(voltage: FloatArray, displacement: FloatArray) -> Record:
 
 
 def sine(samples: int, period: float = 500.0) -> FloatArray:
-    voltage: FloatArray = 50.0 * (1.0 - np.cos(2 * np.pi * np.arange(samples) / period))
-    return voltage
+    return np.asarray(50.0 * (1.0 - np.cos(2 * np.pi * np.arange(samples) / period)))
 
 
 def loop_error(voltage: FloatArray) -> FloatArray:
     """Return an error thirty times the noise that every period repeats, branches apart."""
-    error: FloatArray = 3e-7 * np.sin(voltage / 9.0) + 2e-7 * np.tanh(10.0 * np.gradient(voltage))
-    return error
+    return np.asarray(3e-7 * np.sin(voltage / 9.0) + 2e-7 * np.tanh(10.0 * np.gradient(voltage)))
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
@@ -64,24 +62,26 @@ def test_periods_show_level_and_colour_beside_a_large_repeated_error(
         assert np.all(np.abs(result.autoregression) < 0.05)
 
 
+def assert_noise(result: MeasuredNoise | None, correlation: float) -> None:
+    """Demand the level of the noise, and the correlation of its neighbours."""
+    assert result is not None
+    assert result.level == pytest.approx(LEVEL, rel=0.05)
+    ratio = result.autocovariance[1] / result.autocovariance[0]
+    assert ratio == pytest.approx(correlation, abs=0.05)
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 def test_missing_samples_change_nothing(correlation: float) -> None:
     v = sine(20_000)
     y = 1e-7 * v + loop_error(v) + noise(v.size, correlation)
     y[np.random.default_rng(1).random(v.size) < 0.2] = np.nan
     y[7_000:8_000] = np.nan
-    result = repeats(record(v, y))
-    assert result is not None
-    assert result.level == pytest.approx(LEVEL, rel=0.05)
-    assert result.autocovariance[1] / result.autocovariance[0] == pytest.approx(
-        correlation, abs=0.05
-    )
+    assert_noise(repeats(record(v, y)), correlation)
 
 
 def segment() -> FloatArray:
     t = np.arange(6_000) / 6_000
-    v: FloatArray = 50.0 + 40.0 * np.sin(2 * np.pi * 7 * t) * np.cos(2 * np.pi * 1.5 * t)
-    return v
+    return np.asarray(50.0 + 40.0 * np.sin(2 * np.pi * 7 * t) * np.cos(2 * np.pi * 1.5 * t))
 
 
 def test_a_segment_played_twice_counts_from_where_its_history_is_the_same() -> None:
@@ -93,9 +93,7 @@ def test_a_segment_played_twice_counts_from_where_its_history_is_the_same() -> N
     assert abs(result.stop - 6_400) < 6
     both = max(int(np.argmax(part)), int(np.argmin(part)))
     assert result.settled >= 400 + min(both, 1_500)
-    level = repeats(record(v, y))
-    assert level is not None
-    assert level.level == pytest.approx(LEVEL, rel=0.05)
+    assert_noise(repeats(record(v, y)), 0.0)
 
 
 def test_what_is_not_repeated_shows_nothing() -> None:
@@ -121,12 +119,9 @@ def held_levels() -> tuple[FloatArray, FloatArray]:
 def test_holds_show_the_noise_around_a_creep(correlation: float) -> None:
     v, creep = held_levels()
     result = holds(record(v, creep + noise(v.size, correlation)))
+    assert_noise(result, correlation)
     assert result is not None
     assert result.count == 4
-    assert result.level == pytest.approx(LEVEL, rel=0.05)
-    assert result.autocovariance[1] / result.autocovariance[0] == pytest.approx(
-        correlation, abs=0.05
-    )
 
 
 def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:

@@ -1,4 +1,4 @@
-"""Spikes in motions that no line follows, and what has kinks and jumps of its own."""
+"""Spikes in motions that no line follows, and motions that have kinks and jumps themselves."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.records.spikes import spikes_in
+from psa_casadi.records.suspects import spikes_in
 from psa_casadi.units import BoolArray, FloatArray
 
 N, DT = 3000, 1e-3
@@ -46,7 +46,7 @@ def slow(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 def bounces(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Impacts that no input tells."""
+    """Impacts that no input shows."""
     y = np.abs(np.sin(2.0 * np.pi * 1.7 * T)) * np.exp(-0.3 * T)
     return np.zeros(N), y
 
@@ -54,7 +54,7 @@ def bounces(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 MOTIONS = (resonance, tones, held_steps, slow, bounces)
 
 
-def found(u: FloatArray, y: FloatArray) -> BoolArray:
+def spikes_of(u: FloatArray, y: FloatArray) -> BoolArray:
     return spikes_in(y, u[:, None], 8.0, 1e-3 * float(np.ptp(y)), 3)
 
 
@@ -67,11 +67,11 @@ def test_spikes_are_found_and_nothing_else(motion: Motion, noise: float) -> None
         u, y = motion(rng)
         span = float(np.ptp(y))
         y = y + noise * span * rng.standard_normal(N)
-        clean += int(found(u, y).sum())
+        clean += int(spikes_of(u, y).sum())
         spikes = np.zeros(N, dtype=np.bool_)
         spikes[rng.choice(np.arange(4, N - 4), N // 100, replace=False)] = True
         sizes = rng.choice([-1.0, 1.0], N) * rng.uniform(10.0 * noise + 0.05, 0.5, N) * span
-        mask = found(u, np.where(spikes, y + sizes, y))
+        mask = spikes_of(u, np.where(spikes, y + sizes, y))
         there += int(spikes.sum())
         hit += int((mask & spikes).sum())
         wrong += int((mask & ~spikes).sum())
@@ -86,17 +86,17 @@ def test_a_spike_of_two_or_three_samples_is_found_and_a_step_is_none(width: int)
     u, y = slow(rng)
     y = y + 1e-3 * np.ptp(y) * rng.standard_normal(N)
     y[500 : 500 + width] += 0.2 * np.ptp(y)
-    assert np.flatnonzero(found(u, y)).tolist() == [*range(500, 500 + width)]
+    assert np.flatnonzero(spikes_of(u, y)).tolist() == [*range(500, 500 + width)]
     y[500:] += 0.2 * np.ptp(y)
     y[500 : 500 + width] -= 0.2 * np.ptp(y)
-    assert not found(u, y)[505:].any()
+    assert not spikes_of(u, y)[505:].any()
 
 
 def test_missing_samples_few_samples_and_what_stands_still_have_no_spikes() -> None:
     rng = np.random.default_rng(1)
     u, y = tones(rng)
     y[rng.choice(N, 100, replace=False)] = np.nan
-    assert not found(u, y).any()
+    assert not spikes_of(u, y).any()
     assert not spikes_in(y[:50], u[:50, None], 8.0, 0.0, 3).any()
     assert not spikes_in(np.full(N, np.nan), u[:, None], 8.0, 0.0, 3).any()
     assert not spikes_in(np.ones(N), np.zeros((N, 0)), 8.0, 0.0, 3).any()

@@ -24,8 +24,7 @@ def record(voltage: FloatArray) -> Record:
 
 def triangle(samples: int, period: int) -> FloatArray:
     phase = np.arange(samples) / period % 1.0
-    voltage: FloatArray = 50.0 * (1.0 - np.abs(2.0 * phase - 1.0))
-    return voltage
+    return np.asarray(50.0 * (1.0 - np.abs(2.0 * phase - 1.0)))
 
 
 def test_reversals_of_a_triangle() -> None:
@@ -36,11 +35,10 @@ def test_reversals_of_a_triangle() -> None:
 def test_reversals_see_through_noise_of_a_converter(seed: int) -> None:
     clean = triangle(1000, 200)
     noise = 1e-5 * 50.0 * np.random.default_rng(seed).uniform(-1.0, 1.0, 1000)
-    plateau = np.repeat(clean, 3)  # every sample held for three
-    np.testing.assert_allclose(reversals(clean + noise), np.arange(100, 1000, 100), atol=1)
-    np.testing.assert_allclose(
-        reversals(plateau + np.repeat(noise, 3)), 3 * np.arange(100, 1000, 100), atol=3
-    )
+    turns = np.arange(100, 1000, 100)
+    np.testing.assert_allclose(reversals(clean + noise), turns, atol=1)
+    plateau = np.repeat(clean + noise, 3)  # every sample held for three
+    np.testing.assert_allclose(reversals(plateau), 3 * turns, atol=3)
 
 
 def borders(held_out: BoolArray) -> NDArray[np.intp]:
@@ -89,7 +87,7 @@ def test_what_is_not_held_out_is_told() -> None:
 
 
 def test_what_is_held_out_but_not_fitted_is_told() -> None:
-    """Slow and wide loops are held out; their first tenth, which tells their start, too."""
+    """Slow and wide loops are held out; their first tenth, which determines their start, too."""
     small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
     result = texts(coverage_notes(divided([record(small)], [record(slow)])))
     assert len(result) == 3

@@ -1,4 +1,4 @@
-"""What a sensor has made is told from what a stack has made."""
+"""Samples that a sensor has made are distinguished from those of a stack."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -168,20 +168,13 @@ def test_the_quantum_is_the_step_of_the_sensor() -> None:
     assert result.quantum == pytest.approx(STEP["coarse steps"])
     assert texts(result.notes("r")) == ("r: the displacement is quantised in steps of 400 nm.",)
     counts = np.round(np.asarray(record("sine", "white").displacement) / 1e-7)
-    result = suspects(
-        Record(
-            name="c",
-            time=T,
-            voltage=VOLTAGES["sine"],
-            displacement=counts,
-            displacement_unit="counts",
-        )
-    )
+    in_counts = replace(record("sine", "white"), displacement=counts, displacement_unit="counts")
+    result = suspects(in_counts)
     assert texts(result.notes("c")) == ("c: the displacement is quantised in steps of 1 counts.",)
 
 
 def test_a_reading_repeated_shortly_while_the_stack_moves_is_masked() -> None:
-    """The next reading makes up for what was missed; a stack that always answers late is none."""
+    """The next reading makes up for the motion meanwhile; a stack that is always late is none."""
     inputs = record("triangle", "white")
     y = np.array(inputs.displacement)
     per_sample = 0.01 * RANGE * float(np.max(np.abs(np.diff(inputs.voltage))))

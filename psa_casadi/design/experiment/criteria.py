@@ -7,14 +7,14 @@ derivatives of the trajectories. At one record everything but the trajectories c
 envelope theorem the derivative of a minimum is that of the function at the minimising point, and
 the derivative of a function of the information matrix is linear in that of the sensitivities.
 
-Models that a designed record shall tell apart or sharpen: values, unknowns, what is known.
+Models that a designed record shall separate or sharpen: values, unknowns, what is known.
 
 A rival's unknowns are coordinates delta around its values: its free parameters, and for the new
-record the initial states that no input tells, in nominal sizes, and the offsets of sensors. Of a
-stack the states are its memories, and the one sensor has an offset; any other model begins at
+record the initial states that no input determines, in nominal sizes, and the offsets of sensors.
+Of a stack the states are its memories, and the one sensor has an offset; other models start at
 declared or at unknown states.
-What the records at hand say of the parameters is an information matrix, their own initial states
-and offsets eliminated: H = H_pp - H_pn H_nn^-1 H_np, with the weak priors of the fits.
+The records at hand give an information matrix of the parameters, with the initial states and
+offsets of these records eliminated: H = H_pp - H_pn H_nn^-1 H_np, with the weak priors of the fits.
 
 Separation of rivals: how far one rival's prediction stays from another that is fitted again.
 
@@ -34,7 +34,7 @@ Optimality for parameters: the covariance that a record and the data at hand wou
 
 J (m n, size) holds the exact derivatives of the predicted m outputs by parameters, initial states
 and offsets; W whitens the noise. D minimises ln det C, A the trace, E the largest eigenvalue;
-each is told as minus the logarithm of a mean standard error, so that a difference d of two values
+each is stated as minus the logarithm of a mean standard error, so that a difference d of two values
 means intervals narrower by the factor exp(d). Gradient: d phi(C) = -tr(Psi dPhi), with
 Psi = Phi^-1 E (d phi/d C) E^T Phi^-1 and E the choice of coordinates. Source: Fedorov and Leonov,
 Optimal Design for Nonlinear Response Models, 2013, chapters 2 and 10.
@@ -44,7 +44,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import permutations
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -79,14 +79,6 @@ class Point:
     frozen: Callable[[Signals], float]
 
 
-class Criterion(Protocol):
-    """What is maximised."""
-
-    def at(self, record: Signals) -> Point:
-        """Return value and frozen function at a planned record; raises PsaError."""
-        ...
-
-
 #: Standard errors by which the cautious truth has less of its effect, and the most that it loses.
 _CAUTION, _LOSS = 1.0, 0.75
 #: How far other parameters may move with it, in natural logarithms.
@@ -105,7 +97,7 @@ class SensorNoise:
     correlation: float = 0.0
 
     def on_grid(self, limits: Limits, samples: int) -> Colour:
-        """Return the noise on a grid of fewer samples that tells as much about slow signals.
+        """Return the noise on a grid of fewer samples with the same information on slow signals.
 
         On every m-th sample the correlation is r^m, and the variance is such that the density at
         frequency 0, s^2 (1 + r)/(1 - r), over the number of samples stays what it is.
@@ -126,8 +118,8 @@ class Rival:
     `known` (k, k) is the information of the records at hand and the priors; `evidence` is ln of the
     Bayes factor over the base that those records give. `less` (k,) is the way from `theta` to what
     the rival is taken for where it is the truth. A new record shows the `outputs`, those of `zeros`
-    with an offset; it begins where an ordinary one does, or at the declared states,
-    and between samples its inputs are as `hold` says.
+    with an offset; it starts as an ordinary one, or at the declared states, and `hold` is the
+    course of its inputs between samples.
     """
 
     name: str
@@ -145,9 +137,10 @@ class Rival:
     @property
     def truth(self) -> FloatArray:
         """Return the coordinates (size,) at which it is the truth that a record shall show."""
-        item = np.zeros(len(self.theta)) if self.less is None else self.less
-        low, high = self.bounds()
-        return np.clip(np.append(item, np.zeros(self.size - len(item))), low, high)
+        truth = np.zeros(self.size)
+        if self.less is not None:
+            truth[: len(self.theta)] = self.less
+        return np.clip(truth, *self.bounds())
 
     @cached_property
     def starts(self) -> Mapping[str, tuple[float, float]]:
@@ -210,12 +203,12 @@ class Rival:
 
     def sensitivities(self, record: Signals, delta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the outputs (n, m) and their exact derivatives by delta (n, m, size)."""
-        result, count = self._traced(record, delta, self.unknowns.names), len(self.theta)
+        traced, count = self._traced(record, delta, self.unknowns.names), len(self.theta)
         slopes = self.unknowns.slopes(self.theta + delta[:count])
-        by_parameter = result.sensitivity[:, :, :count] @ slopes
-        by_start = result.sensitivity[:, :, count:] * [size for size, _ in self.starts.values()]
+        by_parameter = traced.sensitivity[:, :, :count] @ slopes
+        by_start = traced.sensitivity[:, :, count:] * [size for size, _ in self.starts.values()]
         offsets = np.broadcast_to(self._offsets, (record.n, *self._offsets.shape))
-        return result.y, np.concatenate([by_parameter, by_start, offsets], axis=2)
+        return traced.y, np.concatenate([by_parameter, by_start, offsets], axis=2)
 
     def _traced(self, record: Signals, delta: FloatArray, wanted: Sequence[str]) -> Traced:
         """Return outputs with their offsets, and derivatives by `wanted` and the starts."""
@@ -230,8 +223,7 @@ class Rival:
 def whitened(noise: Sequence[Colour], values: FloatArray) -> FloatArray:
     """Return outputs (n, m), or their derivatives (n, m, k), over their noise: (m n,), (m n, k)."""
     parts = [item.whiten(values[:, j]) / item.level for j, item in enumerate(noise)]
-    white: FloatArray = np.concatenate(parts)
-    return white
+    return np.concatenate(parts)
 
 
 def rival_of_fit(
@@ -244,8 +236,8 @@ def rival_of_fit(
     """
     count, full = len(fit.unknowns.names), np.diag(1.0 / fit.unknowns.prior**2)
     channels = [c for c in fit.channels if not c.channel.factors]
-    for channel, item in zip(channels, noise, strict=True):
-        white = item.whiten(channel.jacobian) / item.level
+    for channel, colour in zip(channels, noise, strict=True):
+        white = colour.whiten(channel.jacobian) / colour.level
         full = full + white.T @ white
     inner, cross = full[count:, count:], full[:count, count:]
     known = full[:count, :count] - cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T
@@ -257,18 +249,19 @@ def rival_of_fit(
 def _less(name: str, fit: Fit, known: FloatArray) -> FloatArray:
     """Return the way (k,) to the likeliest values with a standard error less of an effect's gain.
 
-    Where a record hardly tells how strong an effect is, its fit may be far too strong, and what
-    would tell that from a rival may not tell the truth. theta moves by C_g / C_gg of the gain's.
+    If a record hardly determines the strength of an effect, its fit may be far too strong, and a
+    record that separates it from a rival may not separate the true effect. theta moves by C_g /
+    C_gg of the gain's.
     """
     gain = next((c.gain for c in fit.model.components if c.name == name), None)
     names = fit.unknowns.names
     if gain is None or gain not in names:
         return np.zeros(len(names))
     k = names.index(gain)
-    item = np.linalg.pinv(known, hermitian=True)[:, k]
+    covariance = np.linalg.pinv(known, hermitian=True)[:, k]
     size = fit.model.values[gain] / fit.unknowns.scale[k]
-    shift = min(_CAUTION * float(np.sqrt(max(item[k], 0.0))), _LOSS * abs(size))
-    less: FloatArray = -float(np.sign(size)) * shift * item / max(item[k], 1e-300)
+    shift = min(_CAUTION * float(np.sqrt(max(covariance[k], 0.0))), _LOSS * abs(size))
+    less: FloatArray = -float(np.sign(size)) * shift * covariance / max(covariance[k], 1e-300)
     farthest = float(np.max(np.abs(less[fit.unknowns.log[: len(less)]]), initial=0.0))
     return less * min(1.0, _FARTHEST / max(farthest, 1e-300))
 
@@ -294,11 +287,11 @@ def noise_of_fit(fit: Fit) -> tuple[tuple[SensorNoise, ...], tuple[Colour, ...]]
     """
     channels = [c for c in fit.channels if not c.channel.factors]
     colours = tuple(colour_of(c.residuals, c.lengths) for c in channels)
-    items = []
+    noise = []
     for channel, colour in zip(channels, colours, strict=True):
         first = colour.autoregression[0]
-        items.append(SensorNoise(channel.rms, float(first[0]) if first.size else 0.0))
-    return tuple(items), colours
+        noise.append(SensorNoise(channel.rms, float(first[0]) if first.size else 0.0))
+    return tuple(noise), colours
 
 
 #: Evaluations of a re-fit at most, while voltages are compared and in the end; when it has settled.
@@ -321,7 +314,7 @@ class _Refit:
 class Separation:
     """The criterion for rivals under the noise of every output on the record's grid.
 
-    A re-fit is cut off after so many `evaluations` while inputs are compared.
+    A re-fit ends after `evaluations` while inputs are compared.
     """
 
     rivals: tuple[Rival, ...]
@@ -334,17 +327,17 @@ class Separation:
 
     def at(self, record: Signals) -> Point:
         """Return the value and a function of the inputs with its gradient."""
-        table = self._refits(record, self.evaluations)
-        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in table.items()}
+        refits = self._refits(record, self.evaluations)
+        inverse = {pair: 1.0 / max(r.distance, LEAST) for pair, r in refits.items()}
         total = sum(inverse.values())
-        value = overall([r.distance for r in table.values()])
+        value = overall([r.distance for r in refits.values()])
 
         def frozen(other: Signals) -> float:
             plain = [r.predict(other, r.truth) for r in self.rivals]
             moved = 0.0
-            for (a, b), r in table.items():
+            for (a, b), r in refits.items():
                 gap = plain[a] - self.rivals[b].predict(other, r.delta)
-                slope = 2.0 * r.difference @ self._white(gap)
+                slope = 2.0 * r.difference @ whitened(self.noise, gap)
                 moved += inverse[a, b] ** 2 / total * float(slope)
             return moved
 
@@ -353,8 +346,8 @@ class Separation:
     def distances(self, record: Signals) -> Mapping[tuple[str, str], float]:
         """Return T of every true rival and other one, by their names, fitted to the end."""
         names = [r.name for r in self.rivals]
-        table = self._refits(record, FINAL)
-        return {(names[a], names[b]): r.distance for (a, b), r in table.items()}
+        refits = self._refits(record, FINAL)
+        return {(names[a], names[b]): r.distance for (a, b), r in refits.items()}
 
     def distance(self, truth: Rival, other: Rival, record: Signals) -> float:
         """Return T of one pair, fitted to the end."""
@@ -364,10 +357,11 @@ class Separation:
     def _refits(self, record: Signals, steps: int) -> dict[tuple[int, int], _Refit]:
         plain = side_by_side(lambda r: r.predict(record, r.truth), self.rivals)
         pairs = list(permutations(range(len(self.rivals)), 2))
-        results = side_by_side(
-            lambda ab: self._refit(plain[ab[0]], self.rivals[ab[1]], record, steps), pairs
-        )
-        return dict(zip(pairs, results, strict=True))
+
+        def refit(pair: tuple[int, int]) -> _Refit:
+            return self._refit(plain[pair[0]], self.rivals[pair[1]], record, steps)
+
+        return dict(zip(pairs, side_by_side(refit, pairs), strict=True))
 
     def _refit(self, target: FloatArray, rival: Rival, record: Signals, evaluations: int) -> _Refit:
         """Fit a rival again to a target (n, m), held by what is known of it."""
@@ -379,22 +373,17 @@ class Separation:
                 y, jacobian = rival.sensitivities(record, delta)
             except PsaError:
                 return None
-            residual = np.concatenate([self._white(y - target), root @ delta])
-            return residual, np.vstack([self._white(jacobian), root])
+            residual = np.concatenate([whitened(self.noise, y - target), root @ delta])
+            return residual, np.vstack([whitened(self.noise, jacobian), root])
 
-        start = np.zeros(rival.size)
-        minimum = minimise(
-            evaluate, start, rival.bounds(), tolerance=_SETTLED, evaluations=evaluations
-        )
+        start, bounds = np.zeros(rival.size), rival.bounds()
+        minimum = minimise(evaluate, start, bounds, tolerance=_SETTLED, evaluations=evaluations)
         if minimum is None:
             raise SimulationError(
                 f"The model with {rival.name} cannot follow a planned input; its values are far"
                 " from physical ones."
             )
         return _Refit(minimum.cost, minimum.theta, -minimum.residual[: target.size])
-
-    def _white(self, values: FloatArray) -> FloatArray:
-        return whitened(self.noise, values)
 
 
 def overall(distances: Collection[float]) -> float:
@@ -452,12 +441,14 @@ class Information:
         return Point(value, lambda other: float(np.sum(weights * self._white(other))))
 
     def standard_errors(self, record: Signals | None) -> Mapping[str, float]:
-        """Return the standard error of every chosen parameter, in its own unit."""
+        """Return the standard error of every chosen parameter, in the parameter's unit."""
         slopes = np.abs(np.diag(self.rival.unknowns.slopes(self.rival.theta)))
-        item = np.sqrt(np.diag(self.covariance(record)))
-        return {
-            n: float(e * slopes[k]) for n, e, k in zip(self.names, item, self._chosen, strict=True)
-        }
+        errors = np.sqrt(np.diag(self.covariance(record))) * slopes[self._chosen]
+        return dict(zip(self.names, errors.tolist(), strict=True))
+
+
+#: What is maximised: `at` returns value and frozen function at a planned record.
+Criterion = Separation | Information
 
 
 def _value(c: FloatArray, optimality: Optimality) -> tuple[float, FloatArray]:
@@ -478,5 +469,4 @@ def _inverse(matrix: FloatArray) -> FloatArray:
     """Invert an information matrix, scaled to a unit diagonal first; unknown offsets are wide."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-12))
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-12 * np.eye(len(matrix))
-    inverse: FloatArray = np.linalg.inv(scaled) * scale[:, None] * scale[None, :]
-    return inverse
+    return np.asarray(np.linalg.inv(scaled) * scale[:, None] * scale[None, :])

@@ -1,4 +1,4 @@
-"""The next experiment: best for chosen parameters, or for telling effects apart."""
+"""The next experiment: best for chosen parameters, or for separating effects."""
 
 import math
 import time as clock
@@ -40,13 +40,13 @@ from psa_casadi.shown import with_units
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.units import FloatArray
 
-#: How often a record may be played until it tells, and the probability that is asked for.
-PLAYS, ASKED = (1, 2, 3, 5), 0.9
+#: How often a record may be played until it names the cause, and the probability demanded.
+PLAYS, CHANCE = (1, 2, 3, 5), 0.9
 
 
 @dataclass(frozen=True)
 class Pair:
-    """How surely a record would tell: growth of ln of the Bayes factor if `truth` is the cause.
+    """Growth of ln of the Bayes factor of `truth` over `other` if `truth` is the cause.
 
     `designed` for the designed record, `usual` for a sine and a triangle of the same length and
     amplitude.
@@ -60,7 +60,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Designed:
-    """What all designed records have: inputs to play and no outputs, and how they were found.
+    """What all designed records have: inputs to play and no outputs, and the search for them.
 
     `kind` is the family of the inputs, `limits` are those of every one.
     """
@@ -81,7 +81,7 @@ def columns_to_play(design: Designed) -> dict[str, FloatArray]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Separated(Designed):
-    """A record that tells effects apart.
+    """A record that separates effects.
 
     Its `kind` is "sine" or "triangle" where no designed one was better; `chance` is for each
     effect the probability that a diagnosis of the data at hand with the record names it alone if it
@@ -95,11 +95,6 @@ class Separated(Designed):
     usual_chance: Mapping[str, Mapping[str, float]]
     plays: int | None
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The effects to tell apart."""
-        return tuple(self.chance)
-
     def factor(self, usual: str) -> float:
         """Return the least ln of the Bayes factor over that with a usual voltage."""
         least = min(p.designed for p in self.pairs)
@@ -111,8 +106,8 @@ class Informative(Designed):
     """A record that sharpens parameters.
 
     `intervals` are the predicted 95 % intervals with it (and the data at hand), `before` those
-    without, each in the parameter's unit and within its bounds; `factor` says by how much the mean
-    standard error of the criterion is smaller than with a usual voltage of the same length and
+    without, each in the parameter's unit and within its bounds; `factor` is the ratio of the mean
+    standard error of the criterion to that with a usual voltage of the same length and
     amplitude.
     """
 
@@ -146,8 +141,8 @@ def naming_probability(
     return min(chances, default=1.0)
 
 
-def tells(criterion: Separation, base: Rival | None, record: Signals) -> bool:
-    """Whether a record names every rival for sure, even with a fraction of its distances."""
+def names_all(criterion: Separation, base: Rival | None, record: Signals) -> bool:
+    """Whether a record names every rival almost certainly, even with less than its distances."""
     try:
         less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
         return min(chances_of(criterion, less, base, record).values()) > _CERTAIN
@@ -158,7 +153,7 @@ def tells(criterion: Separation, base: Rival | None, record: Signals) -> bool:
 def plays_of(
     criterion: Separation, base: Rival | None, record: Signals, chance: Mapping[str, float]
 ) -> int | None:
-    """Return how often a record must be played until it tells; None if `PLAYS[-1]` do not.
+    """Return how often a record must be played to name the cause; None if `PLAYS[-1]` do not.
 
     k records of the same voltage are one whose noise has 1/k of the variance.
     """
@@ -167,7 +162,7 @@ def plays_of(
             quieter = [replace(c, level=c.level / np.sqrt(plays)) for c in criterion.noise]
             often = replace(criterion, noise=quieter)
             chance = chances_of(often, often.distances(record), base, record)
-        if min(chance.values()) >= ASKED:
+        if min(chance.values()) >= CHANCE:
             return plays
     return None
 
@@ -194,12 +189,12 @@ def chances_of(
 USUAL_PERIODS = 10
 #: Ratio of the frequencies of two inputs: the golden one, of which no small multiples meet.
 _APART = 1.618
-#: Gain of an effect that no record tells, over its ordinary size.
+#: Gain of an effect that no record determines, over its ordinary size.
 ORDINARY = 2.5
 #: Samples of the grid on which the result is judged, at most.
 _FINE = 2000
 _SURE = 1.959964
-#: Rivals that a record is designed for, at most: as many as a verdict tells.
+#: Rivals that a record is designed for, at most: as many as a verdict lists.
 _RIVALS = 5
 
 
@@ -228,7 +223,7 @@ def usual_records(limits: Limits, steepest: float) -> dict[str, Record]:
 def usual_inputs(limits: Mapping[str, Limits]) -> dict[str, dict[str, FloatArray]]:
     """Return a sine and a triangle for every input, from its rest on, by the inputs' names.
 
-    Those of a second input and further ones are slower, so that they can be told apart.
+    Those of a second input and further ones are slower, so that they can be separated.
     """
     table: dict[str, dict[str, FloatArray]] = {"sine": {}, "triangle": {}}
     for k, (name, item) in enumerate(limits.items()):
@@ -265,7 +260,7 @@ class _Plan:
         return next(iter(self.limits.values()))
 
     def colours(self, most: int) -> tuple[Colour, ...]:
-        """Return the noise of every output on a grid of at most so many samples."""
+        """Return the noise of every output on a grid of at most this many samples."""
         return tuple(n.on_grid(self.whole, min(self.whole.samples, most)) for n in self.noise)
 
     def coarse(self, record: Signals) -> Signals:
@@ -324,24 +319,24 @@ def separating_experiment(
     usual = plan.usual
     best = search(
         coarser, plan.limits, plan.make, usual=tuple(usual.values()), kinds=kinds, effort=effort,
-        enough=lambda record: tells(coarser, base, record), progress=progress,
+        enough=lambda record: names_all(coarser, base, record), progress=progress,
     )  # fmt: skip
     progress("comparing with a sine and a triangle")
     criterion = Separation(tuple(rivals), plan.colours(_FINE))
     records = {n: plan.coarse(r) for n, r in {"designed": best.record, **usual}.items()}
-    table = {n: criterion.distances(r) for n, r in records.items()}
-    chosen = max(table, key=lambda n: overall(table[n].values()))
+    distances = {n: criterion.distances(r) for n, r in records.items()}
+    chosen = max(distances, key=lambda n: overall(distances[n].values()))
     if chosen != "designed":
-        records["designed"], table["designed"] = records[chosen], table[chosen]
-    chances = {n: chances_of(criterion, table[n], base, r) for n, r in records.items()}
+        records["designed"], distances["designed"] = records[chosen], distances[chosen]
+    chances = {n: chances_of(criterion, distances[n], base, r) for n, r in records.items()}
     return Separated(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
         limits=plan.limits,
         rivals=tuple(rivals),
         pairs=tuple(
-            Pair(a, b, 0.5 * t, {n: 0.5 * table[n][a, b] for n in usual})
-            for (a, b), t in table["designed"].items()
+            Pair(a, b, 0.5 * t, {n: 0.5 * distances[n][a, b] for n in usual})
+            for (a, b), t in distances["designed"].items()
         ),
         chance=chances["designed"],
         usual_chance={n: chances[n] for n in usual},
@@ -380,9 +375,7 @@ def informative_experiment(
     criterion = Information(rival, wanted, optimality, plan.colours(_FINE))
     designed = plan.coarse(best.record)
     value = criterion.at(designed).value
-    usual = {
-        n: float(np.exp(value - criterion.at(plan.coarse(r)).value)) for n, r in plan.usual.items()
-    }
+    usual = {n: criterion.at(plan.coarse(r)).value for n, r in plan.usual.items()}
     return Informative(
         record=best.record,
         kind=best.kind,
@@ -391,7 +384,7 @@ def informative_experiment(
         optimality=optimality,
         intervals=_intervals(rival, criterion.standard_errors(designed)),
         before=_intervals(rival, criterion.standard_errors(None)),
-        factor=usual,
+        factor={n: float(np.exp(value - v)) for n, v in usual.items()},
         evaluations=best.evaluations,
         seconds=clock.perf_counter() - begin,
     )
@@ -404,10 +397,10 @@ def resolving_experiment(
     effort: Effort | None = None,
     progress: Progress = silent,
 ) -> Separated:
-    """Return the record that would tell which of an ambiguous diagnosis' effects is the cause.
+    """Return the record that shows which of an ambiguous diagnosis' effects is the cause.
 
     It has the voltages and the length of the records diagnosed unless `limits` say otherwise; the
-    search is brief by default. Of effects that bend the same curve one stands for all, of many
+    search is brief by default. Of effects that bend the same curve one represents all, of many
     rivals the most likely ones count: each adds a simulation to every trial.
     Raises InputError where the diagnosis is not ambiguous, or between such effects only.
     """
@@ -416,18 +409,15 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    output, _ = one_of_each(d.contenders, d.experiments)
-    if len(output) < 2 or (limits is not None and not _slow(limits)):
-        output = d.contenders  # a new record that shows resonances may tell
-    output = tuple(sorted(output, key=lambda c: -c.evidence)[:_RIVALS])
-    best = min(d.contenders, key=lambda c: c.fit.rms).fit
-    noise, colours = noise_of_fit(best)
-    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence) for c in output]
-    base = rival_of_fit("base", d.base_fit, colours)
+    contenders, _ = one_of_each(d.contenders, d.experiments)
+    if len(contenders) < 2 or (limits is not None and not _slow(limits)):
+        contenders = d.contenders  # a new record that shows resonances may separate them
+    contenders = tuple(sorted(contenders, key=lambda c: -c.evidence)[:_RIVALS])
+    noise, colours = noise_of_fit(min(d.contenders, key=lambda c: c.fit.rms).fit)
+    rivals = [rival_of_fit(c.effect, c.fit, colours, c.evidence) for c in contenders]
+    base, effort = rival_of_fit("base", d.base_fit, colours), effort or BRIEF
     chosen = limits or limits_of([e.record for e in d.experiments])
-    return separating_experiment(
-        rivals, noise, chosen, base=base, effort=effort or BRIEF, progress=progress
-    )
+    return separating_experiment(rivals, noise, chosen, base=base, effort=effort, progress=progress)
 
 
 def rival_of_effect(model: Model, effect: Component, free: Sequence[str], **words: Any) -> Rival:
@@ -440,8 +430,8 @@ def rival_of_effect(model: Model, effect: Component, free: Sequence[str], **word
     if extended.values[gain.name] == 0.0:
         size = ORDINARY * gain.typical(extended.values)
         extended = extended.with_values({gain.name: float(np.clip(size, *gain.bounds))})
-    items = [n for n in effect.fitted if n not in free]
-    return rival_of_model(effect.name, extended, [*free, *items], **words)
+    extra = [n for n in effect.fitted if n not in free]
+    return rival_of_model(effect.name, extended, [*free, *extra], **words)
 
 
 def _slow(limits: Limits) -> bool:
@@ -450,12 +440,12 @@ def _slow(limits: Limits) -> bool:
 
 def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[float, float]]:
     """Return 95 % intervals as those of a fit, of which nothing lies outside the bounds."""
-    table = {}
+    intervals = {}
     for name, error in errors.items():
         value, half, p = rival.model.values[name], _SURE * error, rival.model.parameter(name)
         low, high = value - half, value + half
         if p.log and value > 0.0:
             factor = math.exp(min(half / value, 50.0))
             low, high = value / factor, value * factor
-        table[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
-    return table
+        intervals[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
+    return intervals

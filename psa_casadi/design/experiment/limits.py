@@ -18,7 +18,7 @@ from psa_casadi.records.excitation import time_grid
 from psa_casadi.records.record import Record
 from psa_casadi.units import FloatArray
 
-#: Bandwidth over the sampling rate where none is given: twenty samples for a whole cycle.
+#: Bandwidth over the sampling rate by default: twenty samples for a whole cycle.
 BAND = 0.05
 #: A designed record rests at its first voltage for this share of its samples, or this many.
 REST_SHARE, REST_SAMPLES = 0.01, 4
@@ -32,8 +32,8 @@ class Limits:
     Values between `low` and `high`; `samples` samples over `duration` [s]; changes of at most
     `rate` [1/s], and at most what a `current` [A] into a stack's capacitance allows,
     C_p |dv/dt| <= current; no full cycle shorter than 1/`bandwidth` [1/Hz], so that tones stay
-    below it and the input turns no sooner than after half of that. `bandwidth` None stands for a
-    twentieth of the sampling rate. The record begins at `rest`, None stands for `low`. Raises
+    below it and the input turns no sooner than after half of that. `bandwidth` None means a
+    twentieth of the sampling rate. The record starts at `rest`, None means `low`. Raises
     InputError with all that is wrong.
     """
 
@@ -79,7 +79,7 @@ class Limits:
 
     @property
     def band(self) -> float:
-        """Bandwidth [Hz], given or a twentieth of the sampling rate."""
+        """Bandwidth [Hz], by default a twentieth of the sampling rate."""
         return self.bandwidth or BAND * self.samples / self.duration
 
     @property
@@ -89,7 +89,7 @@ class Limits:
 
     @property
     def rest_share(self) -> float:
-        """Where the record begins within the range: 0 at `low`, 1 at `high`."""
+        """Where the record starts within the range: 0 at `low`, 1 at `high`."""
         rest = self.low if self.rest is None else self.rest
         return float(np.clip((rest - self.low) / self.span, 0.0, 1.0))
 
@@ -159,7 +159,7 @@ class Drive:
 
     @property
     def start(self) -> FloatArray:
-        """Where the search begins (k,)."""
+        """Start of the search (k,)."""
         return np.concatenate([w.start for w in self.waves.values()])
 
     @property
@@ -184,7 +184,7 @@ class Drive:
 def draw(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
     """Draw a waveform of a family at random within the limits; `steepest` [V/s] bounds its rate.
 
-    Raises InputError for an unknown family, and where the rate allows no swing worth the name.
+    Raises InputError for an unknown family, and where the rate allows almost no swing.
     """
     if kind not in KINDS:
         raise InputError(f"There is no family '{kind}'; there are {', '.join(KINDS)}.")
@@ -215,8 +215,7 @@ def _durations(shares: FloatArray, limits: Limits) -> FloatArray:
     room = limits.duration - rest_of(limits)
     least = min(limits.shortest, 0.9 * room / len(shares))
     weights = np.exp(shares - np.max(shares))
-    filled: FloatArray = least + (room - least * len(shares)) * weights / np.sum(weights)
-    return filled
+    return np.asarray(least + (room - least * len(shares)) * weights / np.sum(weights))
 
 
 def _reachable(
@@ -263,8 +262,7 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
         else:
             nodes = np.concatenate([[0.0, first], ends])
             heights = np.concatenate([[rest, rest], levels])
-        inside: FloatArray = limits.low + limits.span * np.interp(time, nodes, heights)
-        return inside
+        return np.asarray(limits.low + limits.span * np.interp(time, nodes, heights))
 
     def slack(p: FloatArray) -> FloatArray:
         change = np.diff(p[:count], prepend=rest)
@@ -299,16 +297,14 @@ def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Wav
 
     def raw(p: FloatArray, time: FloatArray) -> FloatArray:
         angle = 2.0 * np.pi * np.outer(np.maximum(time - first, 0.0) / period, lines)
-        waves: FloatArray = np.cos(angle) @ p[: len(lines)] + np.sin(angle) @ p[len(lines) :]
-        return waves
+        return np.asarray(np.cos(angle) @ p[: len(lines)] + np.sin(angle) @ p[len(lines) :])
 
     def values(p: FloatArray, time: FloatArray) -> FloatArray:
         shape = _risen(raw(p, fine), raw(p, fine), fine, first, grow, rest)
         slope = float(np.max(np.abs(np.diff(shape)))) / (fine[1] - fine[0]) * limits.span
         share = min(1.0, steepest / max(slope, _FASTEST_RAMP))
         wave = np.clip(_risen(raw(p, time), raw(p, fine), time, first, grow, rest), 0.0, 1.0)
-        inside: FloatArray = limits.low + limits.span * (rest + share * (wave - rest))
-        return inside
+        return np.asarray(limits.low + limits.span * (rest + share * (wave - rest)))
 
     amplitude = lines**-0.6
     phase = rng.uniform(0.0, 2.0 * np.pi, len(lines))
@@ -323,8 +319,7 @@ def _risen(
     """Scale a wave to 0 to 1 by its extremes over the `whole` record; let it grow from the rest."""
     low, high = float(np.min(whole)), float(np.max(whole))
     risen: FloatArray = (wave - low) / max(high - low, 1e-12)
-    grown: FloatArray = rest + (risen - rest) * np.clip((time - first) / grow, 0.0, 1.0)
-    return grown
+    return np.asarray(rest + (risen - rest) * np.clip((time - first) / grow, 0.0, 1.0))
 
 
 def _nothing(p: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The next record of any model: rivals, noise and what is known, from what is given; the design."""
+"""The next record of any model: rivals, noise and known information; the design."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -47,7 +47,7 @@ from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.sizes import sized, sizes_of
 from psa_casadi.simulation.start import is_stack
 
-#: Noise of a sensor over what the output moves, where none is given.
+#: Noise of a sensor over what the output moves, by default.
 NOISE_SHARE = 1e-3
 _RAMP = 100
 
@@ -76,30 +76,30 @@ def design_experiment(
 
     Without effects to `separate` it is the record that best determines the `parameters` (all that
     may be fitted): D-, E- or A-optimal for their covariance (known + J^T W J)^-1. Else it is the
-    one that best tells the effects apart, by the least distance between what one rival predicts and
+    one that best separates the effects, by the least distance between what one rival predicts and
     another that is fitted again to that (`psa_casadi.design.experiment.criteria`).
 
     Args:
-        model: A stack's model, or one of one's own.
+        model: A stack's model, or any other.
         limits: `Limits` of every input that is to move, by name; the others stay at their start
-            values. Of a model of one's own the inputs begin at their start values too.
-        records: Records already measured: rivals are fitted to them. None stands for ordinary
+            values. The inputs of any other model than a stack start at these values too.
+        records: Records already measured: rivals are fitted to them. None means ordinary
             sizes of the effects.
-        separate: Names of effects, of a stack's table or as a diagnosis of a model of one's own
-            names them, or components of one's own.
+        separate: Names of effects, of a stack's table or as a diagnosis of any other model names
+            them, or components.
         parameters: Parameters to determine, by default all that are free.
-        free: Parameters of a model of one's own that are not known, by default all that may be
+        free: Parameters of a model that is no stack that are not known, by default all that may be
             fitted.
         optimality: "D" volume, "A" mean square, "E" worst direction of the confidence region.
         noise: Rms of every output's sensor in its unit, by name; one number where there is one
             output. By default a thousandth of what the output moves, or what the fits leave.
         correlation: Correlation of the noise in neighbouring samples.
-        zeros: Outputs of a model of one's own whose zero is unknown in each record.
-        hold: What the inputs of a model of one's own do between samples, by default linear.
-        known_start: The record of a model of one's own will begin at its declared states.
+        zeros: Outputs of a model that is no stack whose zero is unknown in each record.
+        hold: What the inputs of a model that is no stack do between samples, by default linear.
+        known_start: The record of a model that is no stack will start at its declared states.
         kinds: Families of waveforms to choose from.
         effort: How long to search.
-        progress: Is told what is being done.
+        progress: Is called with what is being done.
 
     Raises:
         InputError: limits, names or records do not fit.
@@ -109,16 +109,15 @@ def design_experiment(
         model, limits, records=records, separate=separate, parameters=parameters, free=free,
         zeros=zeros, hold=hold, known_start=known_start, progress=progress,
     )  # fmt: skip
-    output = left if noise is None else None
-    output = output or noise_of(rivals[0], limits, noise, correlation)
+    sensors = left if left and noise is None else noise_of(rivals[0], limits, noise, correlation)
     ready = _resting(model, limits)
     if not separate:
         return informative_experiment(
-            rivals[0], output, ready, names=parameters, optimality=optimality, kinds=kinds,
+            rivals[0], sensors, ready, names=parameters, optimality=optimality, kinds=kinds,
             effort=effort, progress=progress,
         )  # fmt: skip
     return separating_experiment(
-        rivals, output, ready, base=base, kinds=kinds, effort=effort, progress=progress
+        rivals, sensors, ready, base=base, kinds=kinds, effort=effort, progress=progress
     )
 
 
@@ -137,7 +136,7 @@ def noise_of(
     noise: float | Mapping[str, float] | None,
     correlation: float,
 ) -> tuple[SensorNoise, ...]:
-    """Return the noise of every output as given, else a share of what it moves along a ramp.
+    """Return the stated noise of every output, else a share of what it moves along a ramp.
 
     Raises InputError for a number where there are several outputs, and for a wrong name.
     """
@@ -149,23 +148,23 @@ def noise_of(
                 f" {{'{names[0]}': {noise:g}, ...}}."
             )
         noise = {names[0]: float(noise)}
-    item = dict(noise or {})
-    for name, rms in item.items():
+    rms_by_output = dict(noise or {})
+    for name, rms in rms_by_output.items():
         if name not in names or not rms > 0.0:
             raise InputError(
                 f"The noise of '{name}' is given as {rms:g}; give a positive rms of one of"
                 f" {', '.join(names)}."
             )
-    if len(item) < len(names):
+    if len(rms_by_output) < len(names):
         some = next(iter(limits.values()))
         time = some.grid(_RAMP)
         ramps = {n: each.low + each.span * time / time[-1] for n, each in limits.items()}
-        displayed = rival.predict(record_for(rival.model)("ramp", time, ramps), rival.truth)
+        outputs = rival.predict(record_for(rival.model)("ramp", time, ramps), rival.truth)
         sizes = dict(zip(rival.model.output_names, rival.model.output_nominals(), strict=True))
-        for name, y in zip(names, displayed.T, strict=True):
+        for name, y in zip(names, outputs.T, strict=True):
             moved = float(np.ptp(y))
-            item.setdefault(name, NOISE_SHARE * (moved or float(sizes[name])))
-    return tuple(SensorNoise(item[n], correlation) for n in names)
+            rms_by_output.setdefault(name, NOISE_SHARE * (moved or float(sizes[name])))
+    return tuple(SensorNoise(rms_by_output[n], correlation) for n in names)
 
 
 def rivals_of(
@@ -215,8 +214,8 @@ def rivals_of(
             rival_of_effect(extended(model, [e]), e.component, names, **words) for e in effects
         ], None, None  # fmt: skip
     opened = replace(base, model=with_ports(base.model))
-    table = tuple(e.component for e in effects)
-    task = Task(runs, table, Pack(), progress=progress)
+    components = tuple(e.component for e in effects)
+    task = Task(runs, components, Pack(), progress=progress)
     return _fitted(base, fitted_rivals(opened, task), words)
 
 
@@ -229,15 +228,14 @@ def _of_a_stack(
 ) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
     free = [n for n in CORE if n in model.parameter_names]
     if not separate:
-        items = [n for e in model.effects for n in e.fitted]
-        names = dict.fromkeys(
-            [*free, *items, *(n for n in parameters if n in model.parameter_names)]
-        )
-        return [rival_of_model(model.name, model, tuple(names))], None, None
+        fitted = [n for e in model.effects for n in e.fitted]
+        wanted = [n for n in parameters if n in model.parameter_names]
+        names = tuple(dict.fromkeys([*free, *fitted, *wanted]))
+        return [rival_of_model(model.name, model, names)], None, None
     effects = [EFFECTS[e] if isinstance(e, str) else e for e in separate]
     if records is not None:
-        base, result, _ = fit_contenders(records, effects, model=model, progress=progress)
-        return _fitted(base, result, {})
+        base, contenders, _ = fit_contenders(records, effects, model=model, progress=progress)
+        return _fitted(base, contenders, {})
     plain = model.without(e.name for e in effects)
     free = [n for n in free if n in plain.parameter_names]
     return [rival_of_effect(model, e, free) for e in effects], None, None
@@ -260,7 +258,7 @@ def _attached(
     runs: Sequence[Experiment],
     base: Fit | None,
 ) -> list[Attached]:
-    """Return effects of a model of one's own, by their names or as components.
+    """Return effects of a model that is no stack, by their names or as components.
 
     Their sizes are those of the records, else those that a triangle within the limits shows.
     """
@@ -271,17 +269,17 @@ def _attached(
         sizes = sizes_of(model, [whole(planned)])
     else:
         sizes = sizes_of(base.model, runs, base.starts())
-    table = {e.name: e for e in effects_of(model, sizes)}
-    items = []
+    known = {e.name: e for e in effects_of(model, sizes)}
+    attached = []
     for effect in separate:
         if isinstance(effect, Component):
-            items.append(of_ones_own(model, effect))
-        elif effect in table:
-            items.append(table[effect])
+            attached.append(of_ones_own(model, effect))
+        elif effect in known:
+            attached.append(known[effect])
         else:
-            near = get_close_matches(effect, table, 3, 0.3) or list(table)[:3]
+            near = get_close_matches(effect, known, 3, 0.3) or list(known)[:3]
             raise InputError(
-                f"There is no effect '{effect}' of the model '{model.name}'; of {len(table)} the"
+                f"There is no effect '{effect}' of the model '{model.name}'; of {len(known)} the"
                 f" nearest are {', '.join(near)}."
             )
-    return items
+    return attached

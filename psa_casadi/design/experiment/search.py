@@ -36,13 +36,13 @@ class Effort:
     seed: int = 1
 
 
-#: A search that takes a few seconds: enough where any good voltage tells.
+#: A search that takes a few seconds: enough where any good voltage separates.
 BRIEF = Effort(draws=6, starts=1, steps=5)
 
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The best record found in full, its family, and values and gradients it took."""
+    """The best record in full, its family, and values and gradients it took."""
 
     record: Signals
     kind: str
@@ -73,34 +73,32 @@ def search(
     effort = effort or Effort()
     problem, rng = _Problem(criterion, limits, make), np.random.default_rng(effort.seed)
     # no faster than the grid of the comparison can show
-    rate = len(problem.time) / problem.limits.duration
-    slower = {
-        n: replace(item, bandwidth=min(item.band, rate / _CYCLE)) for n, item in limits.items()
-    }
+    band = len(problem.time) / problem.limits.duration / _CYCLE
+    slower = {n: replace(each, bandwidth=min(each.band, band)) for n, each in limits.items()}
     pool = [
         Drive(kind, {n: draw(kind, item, item.rate, rng) for n, item in slower.items()})
         for kind in kinds
         for _ in range(effort.draws)
     ]
     progress(f"comparing {len(pool)} inputs")
-    values = np.array(side_by_side(lambda d: problem.point(d, d.start).value, pool))
+    values = np.array(side_by_side(lambda d: problem.of(problem.record(d, d.start)).value, pool))
     order = np.argsort(values)[::-1]
     if values[order[0]] <= _POOR:
         raise SimulationError(
             "None of the drawn inputs could be simulated with the models; parameter values far"
             " from physical ones are the likely cause: check them."
         )
-    best, result, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
+    best, winner, better = values[order[0]], (pool[order[0]], pool[order[0]].start), True
     for number, k in enumerate(order[: effort.starts]):
-        if better and enough(problem.record(*result)):
+        if better and enough(problem.record(*winner)):
             break
         progress(f"improving {number + 1} of {effort.starts}: {pool[k].kind}")
         p, value = problem.improve(pool[k], effort.steps)
         better = value > best
         if better:
-            best, result = value, (pool[k], p)
-    record = replace(problem.record(*result, problem.limits.grid()), name="designed")
-    kind = str(result[0].kind)
+            best, winner = value, (pool[k], p)
+    record = replace(problem.record(*winner, problem.limits.grid()), name="designed")
+    kind = str(winner[0].kind)
     for other in usual:
         value = problem.of(coarse(other, len(problem.time), make)).value
         if value > best:
@@ -109,7 +107,7 @@ def search(
 
 
 def coarse(record: Signals, samples: int, make: Make) -> Signals:
-    """Return a record on a grid of at most so many samples."""
+    """Return a record on a grid of at most this many samples."""
     if record.n <= samples:
         return record
     spacing = record.sample_time * record.n / samples
@@ -123,7 +121,7 @@ class _Problem:
 
     def __init__(self, criterion: Criterion, limits: Mapping[str, Limits], make: Make) -> None:
         self._criterion, self._every, self._make = criterion, limits, make
-        self.limits = next(iter(limits.values()))  # of all alike: duration and samples
+        self.limits = next(iter(limits.values()))  # of all the same: duration and samples
         self.time = self.limits.grid(min(self.limits.samples, GRID))
         self.evaluations = 0
 
@@ -133,10 +131,6 @@ class _Problem:
         columns = drive.columns(p, at)
         ends = {n: (self._every[n].low, self._every[n].high) for n in columns}
         return self._make(drive.kind, at, {n: np.clip(c, *ends[n]) for n, c in columns.items()})
-
-    def point(self, drive: Drive, p: FloatArray) -> Point:
-        """Return the criterion at p."""
-        return self.of(self.record(drive, p))
 
     def of(self, record: Signals) -> Point:
         """Return the criterion at a record; a poor value where the models cannot follow."""
@@ -172,7 +166,7 @@ class _Problem:
             nonlocal best
             key = p.tobytes()
             if key not in points:
-                points[key] = self.point(drive, np.clip(p, *drive.bounds))
+                points[key] = self.of(self.record(drive, np.clip(p, *drive.bounds)))
                 if points[key].value > best[1] and np.all(drive.slack(p) >= -1e-9):
                     best = (np.clip(p, *drive.bounds), points[key].value)
             return points[key]
@@ -181,8 +175,7 @@ class _Problem:
             return -at(p).value
 
         def slope(p: FloatArray) -> FloatArray:
-            downhill: FloatArray = -self.gradient(drive, p, at(p))
-            return downhill
+            return np.asarray(-self.gradient(drive, p, at(p)))
 
         constraints: Any = []
         if drive.slack(drive.start).size > 0:

@@ -24,7 +24,7 @@ ACTS_ON = ("wafers", "tip")
 
 @dataclass(frozen=True)
 class Mechanics:
-    """The linear mechanics of a stack, and what stands before it.
+    """The linear mechanics of a stack, and what precedes it.
 
     Polynomials, highest power first: `numerator` N, `denominator` D [N/m], and `path` M. `lag` is
     tau and `drive` R_s C_p [s]; `force` is k_L u_rated [N].
@@ -110,8 +110,7 @@ def mechanical_poles(mechanics: Mechanics, mounting: Mounting) -> ComplexArray:
     """Return the roots of D + M H [rad/s], slowest first."""
     unit = mechanics.frequency
     scaled = in_units(closed_polynomial(mechanics, mounting), unit)
-    result = np.roots(scaled / np.max(np.abs(scaled))) * unit
-    roots: ComplexArray = np.asarray(result, dtype=np.complex128)
+    roots = np.asarray(np.roots(scaled / np.max(np.abs(scaled))) * unit, dtype=np.complex128)
     return roots[np.argsort(np.abs(roots), kind="stable")]
 
 

@@ -82,7 +82,7 @@ def _check_limits(limits: Limits, problems: Problems) -> None:
 
 
 _LIMITS = Limits()
-#: A goal counts as reached if it is missed by less than this share.
+#: A goal counts as reached if the shortfall is less than this share.
 _REACHED = 1e-3
 #: A wanted pole counts as reached if one lies within this share of its size.
 _NEAR = 1e-2
@@ -111,8 +111,8 @@ class MechanismDesign:
     """A designed mechanism, what was wanted, and what is reached without it and with it.
 
     `poles` and `free_poles` [rad/s] are those of the mechanics, slowest first; `lag_pole` is -1/tau
-    [rad/s], which no mechanism moves. `attained` says whether every goal is reached within limits;
-    `binding` names the limits that the design stands at. `agreeing` of `starts` searches led here.
+    [rad/s], which no mechanism moves. `attained`: every goal is reached within limits;
+    `binding` names the limits that the design reaches. `agreeing` of `starts` searches led here.
     """
 
     mechanics: Mechanics
@@ -154,14 +154,14 @@ def design_mechanism(
     """
     check_goals(damping, bandwidth, poles, limits, starts)
     mechanics = mechanics_of(model, acts_on)
-    result = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
-    best = result[0]
+    searches = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
+    best = searches[0]
     if not best.converged:
         raise InputError(
-            f"None of {len(result)} searches for a mechanism ended well; the limits exclude each"
+            f"None of {len(searches)} searches for a mechanism ended well; the limits exclude each"
             " other, or the goals are far from what the stack can do: widen the limits."
         )
-    agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in result)
+    agreeing = sum(c.converged and c.cost < best.cost + _SAME for c in searches)
     mounting, free = best.mounting, Mounting(0.0, 0.0, 0.0)
     reached, closed = _measured(mechanics, mounting), mechanical_poles(mechanics, mounting)
     goals, attained = [], True
@@ -178,7 +178,7 @@ def design_mechanism(
         mechanics, mounting, acts_on, tuple(goals), limits, poles=closed,
         free_poles=mechanical_poles(mechanics, free), lag_pole=-1.0 / mechanics.lag,
         reached=reached, free=_measured(mechanics, free), attained=attained,
-        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(result),
+        binding=_binding(mounting, reached, limits), agreeing=agreeing, starts=len(searches),
     )  # fmt: skip
 
 
@@ -214,9 +214,8 @@ def mounted_model(model: Model, design: MechanismDesign) -> Model:
             " here solves for: take that effect out, or couple the two FMUs (--port)."
         )
     m = design.mounting
-    whole = model.plant().with_components(
-        (*model.plant().components, PRESTRESS_MOUNTS[design.acts_on])
-    )
+    plant, mount = model.plant(), PRESTRESS_MOUNTS[design.acts_on]
+    whole = plant.with_components((*plant.components, mount))
     values = {"mounted": 1.0, "m_m": m.mass, "c_m": m.damping, "k_m": m.stiffness}
     notes = (f"With a prestress mechanism for {' and '.join(design.goals)}.",)
     return whole.with_values(values, provenance=Provenance(free=("m_m", "c_m", "k_m"), notes=notes))
@@ -227,9 +226,8 @@ def root_locus(design: MechanismDesign, gains: FloatArray) -> ComplexArray:
     m = design.mounting
     rows: list[ComplexArray] = []
     for g in gains:
-        poles = mechanical_poles(
-            design.mechanics, Mounting(g * m.mass, g * m.damping, g * m.stiffness)
-        )
+        mounting = Mounting(g * m.mass, g * m.damping, g * m.stiffness)
+        poles = mechanical_poles(design.mechanics, mounting)
         if rows and len(poles) == len(rows[-1]):  # each next to the one it came from
             left = list(poles)
             nearest = [left.pop(int(np.argmin(np.abs(np.array(left) - b)))) for b in rows[-1]]
@@ -259,7 +257,7 @@ def _binding(m: Mounting, r: Reached, limits: Limits) -> tuple[str, ...]:
         ("largest mass", m.mass, limits.mass[1]),
         ("largest damping", m.damping, limits.damping[1]),
     )
-    items = [name for name, value, limit in ends if value > 0.99 * limit]
+    names = [name for name, value, limit in ends if value > 0.99 * limit]
     if limits.mass[0] > 0.0 and m.mass < 1.01 * limits.mass[0]:
-        items.append("least mass")
-    return tuple(items)
+        names.append("least mass")
+    return tuple(names)

@@ -8,8 +8,8 @@ w_i and damping ratio z_i of every pair of mechanical poles, tied to the mechani
 
 so that a pair that turns from complex to real has no kink, and an unstable loop does not exist. One
 more unknown is the frequency w_b below which |X/F| stays above -3 dB of its static value. IPOPT
-takes the derivatives from CasADi. A goal that the limits do not allow is missed by as little as
-possible: its shortfall, in logarithms, is an unknown with a steep cost.
+takes the derivatives from CasADi. The shortfall of a goal that the limits do not allow is as small
+as possible: in logarithms, it is an unknown with a steep cost.
 """
 
 from collections.abc import Iterable
@@ -100,12 +100,12 @@ class Candidate:
 def search(mechanics: Mechanics, wish: Wish, starts: int, seed: int = 0) -> list[Candidate]:
     """Search from several starts, and return what each led to, best first."""
     draw = np.random.default_rng(seed)
-    count, result = (len(mechanics.denominator) - 1) // 2, []
+    count, candidates = (len(mechanics.denominator) - 1) // 2, []
     # which pair of the stack's poles each wanted pair may become
     for order in permutations(range(count), len(pairs_of(wish.poles))):
         problem = _Problem(mechanics, wish, order)
-        result += [problem.solve(draw) for _ in range(starts)]
-    return sorted(result, key=lambda c: (not c.converged, c.cost))
+        candidates += [problem.solve(draw) for _ in range(starts)]
+    return sorted(candidates, key=lambda c: (not c.converged, c.cost))
 
 
 class _Problem:
@@ -217,7 +217,7 @@ class _Problem:
         z = np.maximum(z, 1e-3)  # unstable ones are damped
         x0 = [*start, *np.log(w), *np.log(z), min(np.log(w).min(), 3.0), min(0.0, log(min(z))), 0.0]
         few = [-25.0] * self.count, [25.0] * self.count
-        result = self.solver(
+        solution = self.solver(
             x0=x0,
             lbx=[*low, *few[0], *[log(1e-4)] * self.count, -25.0, -12.0, 0.0],
             ubx=[*high, *few[1], *[log(1e5)] * self.count, 25.0, 0.0, 50.0],
@@ -225,8 +225,8 @@ class _Problem:
             ubg=[0.0] * self.rows[0] + [np.inf] * self.rows[1],
         )
         raise_if_stopped()  # which the solver takes for a failure
-        h = np.clip(np.array(result["x"]).ravel()[:3], low, high)
-        cost = float(result["f"])
+        h = np.clip(np.array(solution["x"]).ravel()[:3], low, high)
+        cost = float(solution["f"])
         ended = bool(self.solver.stats()["success"]) and isfinite(cost)
         values = (float(a * u) for a, u in zip(h, unit, strict=True))
         return Candidate(Mounting(*values), cost, ended)

@@ -66,7 +66,7 @@ def zero_phase_inverse(part: LinearPart, wanted: FloatArray, step: float) -> Flo
 
 _PARTS = 4  # sub-intervals of a sample for the hysteresis inverse
 _LEAST_SLOPE = 0.05  # of k_L; a stack whose force falls with rising voltage has no inverse
-_WORTH = 0.8  # a trial that leaves more of the error than this is the last
+_PROGRESS = 0.8  # a trial that leaves more of the error than this is the last
 _MOST_STROKES = 5.0  # range of a path over the stroke, above which its unit is wrong
 _MOST_SAMPLES = 4  # uniform samples for each sample of a path that is not uniform
 
@@ -87,7 +87,7 @@ def invert(
     """Return the voltage for a path, and the error that the full simulator states.
 
     `trials` bounds the runs of the simulator whose error is fed back. The path is sampled evenly
-    inside; the voltage is given at the path's own instants. It keeps within `limits` (a current to
+    inside; the voltage is returned at the path's instants. It keeps within `limits` (a current to
     about 1 %).
 
     Raises InputError for a model that is no stack, for a path that it cannot hold at its start, and
@@ -113,11 +113,11 @@ def invert(
         for _ in range(max(trials, 1)):
             free = _voltage(model, even, wanted, rest)
             voltage = held(model, limits, even.time, free)
-            displayed = respond(model, even.time, voltage).displacement
-            made.append(_Trial(wanted, voltage, error_of(even, displayed)))
-            left = np.where(voltage == free, even.displacement - displayed, 0.0)
+            displacement = respond(model, even.time, voltage).displacement
+            made.append(_Trial(wanted, voltage, error_of(even, displacement)))
+            left = np.where(voltage == free, even.displacement - displacement, 0.0)
             felt.append(float(np.linalg.norm(left)))
-            if len(felt) > 1 and felt[-1] > _WORTH * felt[-2]:
+            if len(felt) > 1 and felt[-1] > _PROGRESS * felt[-2]:
                 break
             wanted = wanted + zero_phase_inverse(part, left, even.step)
         return min(made[first:], key=lambda t: t.error.rms)
@@ -275,15 +275,19 @@ def _check(target: Target, record: Record) -> None:
             f"{name}: lasts {record.time[-1] - record.time[0]:.4g} s, the path"
             f" {target.time[-1]:.4g} s; record the whole path, from its first sample on."
         )
-    displayed = record.displacement
-    if displayed is None or record.displacement_unit != "m" or not np.isfinite(displayed).all():
+    displacement = record.displacement
+    if (
+        displacement is None
+        or record.displacement_unit != "m"
+        or not np.isfinite(displacement).all()
+    ):
         problems.add(
             f"{name}: a trial needs a displacement in a unit of length at every sample; fill"
             " the gaps, or convert counts by the sensor's scale."
         )
-    elif np.ptp(displayed) < _MOVED * target.span:
+    elif np.ptp(displacement) < _MOVED * target.span:
         problems.add(
-            f"{name}: the stack moved by {1e6 * np.ptp(displayed):.3g} um, the path moves by"
+            f"{name}: the stack moved by {1e6 * np.ptp(displacement):.3g} um, the path moves by"
             f" {1e6 * target.span:.3g} um; this is no trial of it, or in another unit."
         )
     problems.raise_if_any()

@@ -8,7 +8,7 @@ linear program asks for the least T for which some voltage within the limits bri
 
 and the full simulator plays its answer. The difference at the end between the two goes into f, d
 and g, and the program is solved again, until the simulator itself arrives at rest: no smooth form,
-and no discretisation but the stepper's own, is in the result. The voltage then holds its last
+and no discretisation but the stepper's, is in the result. The voltage then holds its last
 value.
 """
 
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_ends, respond
+from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_start, respond
 from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import slopes_at_rest
@@ -77,8 +77,8 @@ class LinearMove:
         xdot, y = m.structure.f(time, arrival, u, m.parameter_vector())
         x = arrival[rows] / size
         rates = np.array(xdot).ravel()[rows] / size - self.a @ x - self.b * last
-        displayed = float(y[m.output_names.index("displacement")])
-        return Offsets(state, rates, displayed - float(self.c @ x))
+        displacement = float(y[m.output_names.index("displacement")])
+        return Offsets(state, rates, displacement - float(self.c @ x))
 
     def shortest(self, offsets: Offsets) -> tuple[float, FloatArray]:
         """Return the least length [s] by halving, and its voltage (n + 1,) [V]."""
@@ -136,7 +136,7 @@ class LinearMove:
     def _conditions(self, length: float, offsets: Offsets) -> tuple[FloatArray, FloatArray]:
         """Return the rows of rest and position, times the voltage (n,), and what they must give.
 
-        Rest is asked as x(T) = -a^-1 (b v_N + f), so that every row counts in nominals.
+        Rest is required as x(T) = -a^-1 (b v_N + f), so that every row counts in nominals.
         """
         gain, free = self._march(length)
         free = free + offsets.state
@@ -169,11 +169,8 @@ class LinearMove:
         decay = np.exp(-h / (p["R_s"] * p["C_p"]))
         later = 1.0 - p["R_s"] * p["C_p"] / h * (1.0 - decay)
         before = 1.0 - decay - later
-        upper, lower, rest = (
-            [later, before],
-            [1.0, -decay],
-            [decay * self.rest + before * self.rest],
-        )
+        upper, lower = [later, before], [1.0, -decay]
+        rest = [decay * self.rest + before * self.rest]
         u = scipy.signal.lfilter(upper, lower, np.eye(self.n), axis=0)
         free = scipy.signal.lfilter(upper, lower, np.zeros(self.n), zi=rest)[0]
         scale = p["G"] / p["R_s"]
@@ -259,7 +256,7 @@ def quickest_move(
     limits that are missing or do not hold one of the positions, and PsaError if there is no move.
     """
     started = clocks.perf_counter()
-    rest, _ = move_ends(model, begin, end, limits)
+    rest = move_start(model, begin, end, limits)
     linear = linear_move(model, rest, end, limits, intervals)
     none = np.zeros(len(linear.fast))
     length, voltage = linear.shortest(Offsets(none, none, 0.0))
@@ -306,7 +303,7 @@ def _plays(
 
 @dataclass(frozen=True, eq=False)
 class _Play:
-    """What the simulator says: the response, and how far its end is from rest.
+    """The simulator's result: the response, and how far its end is from rest.
 
     `distance` is the larger of the hold's swing and its offset, over the move.
     """
@@ -325,9 +322,9 @@ def _play(
     n = len(voltage) - 1
     time: FloatArray = np.asarray(length / n * np.arange(n + 2 + HOLD * n), dtype=float)
     whole = np.concatenate([voltage[:1], voltage, np.full(HOLD * n, voltage[-1])])
-    result = respond(model, time, whole)
-    held, hold = result.displacement[n + 1 :], time[n + 1 :]
+    response = respond(model, time, whole)
+    held, hold = response.displacement[n + 1 :], time[n + 1 :]
     slow = np.polynomial.Polynomial.fit(hold, held, 2)(hold)
     swing, position = float(np.max(np.abs(held - slow))), float(slow[0])
     distance = max(swing, abs(position - end)) / abs(linear.travel)
-    return _Play(length, result, position, swing, distance)
+    return _Play(length, response, position, swing, distance)

@@ -1,4 +1,4 @@
-"""Paths, the amplifier's limits, and what the full simulator says of a voltage."""
+"""Paths, the amplifier's limits, and the full simulator's response to a voltage."""
 
 import os
 from dataclasses import dataclass
@@ -42,7 +42,7 @@ class Target:
 def read_target(path: str | os.PathLike[str]) -> Target:
     """Read a path from a CSV file with the columns `time [s]` and `displacement [um]`.
 
-    Raises InputError with every mistake found: a column missing, a cell that is no number, times
+    Raises InputError with every mistake: a column missing, a cell that is no number, times
     that do not increase, fewer than ten samples, a displacement that never changes.
     """
     outcome = apart.read(str(path), Request(needed=("displacement",)))
@@ -52,20 +52,19 @@ def read_target(path: str | os.PathLike[str]) -> Target:
         raise InputError(
             f"{path}: holds no path; name its columns as 'time [s],displacement [um]'."
         )
-    units, values = outcome.units, outcome.values
+    units = outcome.units
     if parse_unit(units["displacement"]).counts:
         raise InputError(
             f"{path}: line 1: the displacement is in counts of a sensor, which is no length;"
             " give the path in um."
         )
-    time, displacement = (
-        to_si(values[:, list(units).index(n)], units[n]) for n in ("time", "displacement")
-    )
+    columns = dict(zip(units, outcome.values.T, strict=True))
+    time, displacement = (to_si(columns[n], units[n]) for n in ("time", "displacement"))
     return checked_target(time, displacement, str(path))
 
 
 def checked_target(time: FloatArray, displacement: FloatArray, where: str = "target") -> Target:
-    """Return a path after checking it; raises InputError with every mistake found."""
+    """Return a path after checking it; raises InputError with every mistake."""
     problems = Problems()
     if time.size < _FEWEST or time.shape != displacement.shape:
         problems.add(
@@ -105,12 +104,10 @@ class AmplifierLimits:
                 f"The lowest voltage, {self.min_voltage:g} V, is not below the highest,"
                 f" {self.max_voltage:g} V; correct one of them."
             )
-        for name, value, unit in (
-            ("rate", self.max_rate, "V/s"),
-            ("current", self.max_current, "A"),
-        ):
-            if not value > 0.0:
-                problems.add(f"The largest {name} is {value:g} {unit}; give a positive one.")
+        for name, most in (("rate", self.max_rate), ("current", self.max_current)):
+            if not most > 0.0:
+                unit = "V/s" if name == "rate" else "A"
+                problems.add(f"The largest {name} is {most:g} {unit}; give a positive one.")
         problems.raise_if_any()
 
 
@@ -251,7 +248,7 @@ def demand_stack(model: Model) -> None:
 def smooth_form(model: Model, width: float) -> Model:
     """Return the model with the kinks at u' = 0 rounded over the rates `width` [V/s].
 
-    The model's own sign of the rate is u' / sqrt(u'^2 + hold_rate^2); the smooth form has `width`
+    The model's sign of the rate is u' / sqrt(u'^2 + hold_rate^2); the smooth form has `width`
     in place of a smaller hold_rate. A model without hysteresis is returned as it is.
     """
     if "hold_rate" not in model.values:
@@ -276,12 +273,12 @@ def rest_at(model: Model, displacement: float) -> tuple[float, FloatArray]:
     before, after, size = 0.0, 1.0, model.output_nominals()[row]
     reached = settled(before)[0]
     for _ in range(20):
-        result, x = settled(after)
-        if result == reached or abs(result - displacement) < 1e-9 * size:
+        position, x = settled(after)
+        if position == reached or abs(position - displacement) < 1e-9 * size:
             break
-        slope = (result - reached) / (after - before)
-        before, reached, after = after, result, after + (displacement - result) / slope
-    if not abs(result - displacement) < 1e-6 * size:
+        slope = (position - reached) / (after - before)
+        before, reached, after = after, position, after + (displacement - position) / slope
+    if not abs(position - displacement) < 1e-6 * size:
         raise InputError(
             f"No voltage holds the stack at {1e6 * displacement:g} um; the path is likely in"
             " another unit, or far beyond the stroke: correct it."
@@ -289,10 +286,8 @@ def rest_at(model: Model, displacement: float) -> tuple[float, FloatArray]:
     return after, x
 
 
-def move_ends(
-    model: Model, begin: float, end: float, limits: AmplifierLimits
-) -> tuple[float, FloatArray]:
-    """Return voltage [V] and state where a move [m] begins; both its ends must be within limits."""
+def move_start(model: Model, begin: float, end: float, limits: AmplifierLimits) -> float:
+    """Return the voltage [V] at the begin of a move [m]; both ends must be within the limits."""
     demand_stack(model)
     problems = Problems()
     if begin == end:
@@ -302,18 +297,18 @@ def move_ends(
             "A quickest move uses the whole voltage range; give both limits of the voltage."
         )
     problems.raise_if_any()
-    (rest, start), (final, _) = rest_at(model, begin), rest_at(model, end)
-    for where, voltage in ((begin, rest), (end, final)):
+    rest = rest_at(model, begin)[0]
+    for where, voltage in ((begin, rest), (end, rest_at(model, end)[0])):
         if not limits.min_voltage - 1e-9 <= voltage <= limits.max_voltage + 1e-9:
             problems.add(
                 f"The stack rests at {1e6 * where:.4g} um with {voltage:.4g} V, outside the voltage"
                 " limits; widen them or choose another position."
             )
     problems.raise_if_any()
-    return float(np.clip(rest, limits.min_voltage, limits.max_voltage)), start
+    return float(np.clip(rest, limits.min_voltage, limits.max_voltage))
 
 
-#: Share of the largest current that a held voltage aims at: the lag's own part needs the rest.
+#: Share of the largest current that a held voltage aims at: the lag's part needs the rest.
 _CURRENT = 0.98
 #: A limit binds where no more than this share of it is left.
 _BINDS = 0.01
@@ -344,7 +339,7 @@ def held(
 
 
 def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
-    """Return one sentence for each limit that a response stands at: which, and from when to when.
+    """Return one sentence for each limit that a response reaches: which, and from when to when.
 
     A rate or a current counts where it lasts for three samples at least.
     """

@@ -1,8 +1,8 @@
 """The voltage that makes a stack's displacement follow a path within the amplifier's limits.
 
 Direct collocation on the smooth form of the model, solved by IPOPT from the inverted model's
-voltage; then the full simulator is run, and what it shows beside the program's own discretisation
-is taken off the path before the program is solved once more.
+voltage; then the full simulator is run, and its error beyond the program's discretisation
+is subtracted from the path before the program is solved once more.
 
 Direct collocation: a stack's equations over the samples of a path as constraints of a program.
 
@@ -124,9 +124,9 @@ def _at_nodes(
     grid = np.concatenate([time[:1], _nodes(time).T.ravel()])
     u = input_samples(model, len(grid), {"voltage": np.interp(grid, time, voltage)})
     steps = run(model, grid, u, start, rtol=1e-7)
-    displayed = steps.y[1:, model.output_names.index("displacement")]
+    displacement = steps.y[1:, model.output_names.index("displacement")]
     states = steps.x[1:] / model.state_nominals()
-    return states.reshape(count, -1).T, displayed.reshape(count, 2).T
+    return states.reshape(count, -1).T, displacement.reshape(count, 2).T
 
 
 def _nodes(time: FloatArray) -> FloatArray:
@@ -134,7 +134,8 @@ def _nodes(time: FloatArray) -> FloatArray:
     return np.array([time[:-1] + NODES[0] * np.diff(time), time[1:]])
 
 
-#: Price of the voltage's second differences over the voltage scale, beside errors over the range.
+#: Price of the voltage's second differences over the voltage scale, relative to errors over the
+#: range.
 PRICE = 1e-2
 #: Weight of the mean square error where the largest error is minimised, so that the rest of the
 #: path does not float.
@@ -154,7 +155,7 @@ class NoSolutionError(PsaError):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is asked: instants (n,) [s], range of the path [m], voltage at rest and its scale [V].
+    """The task: instants (n,) [s], range of the path [m], voltage at rest and its scale [V].
 
     `start` (nx,) is the state before the first sample, over nominal. The voltage stays at `rest`
     over the first interval, so that every simulator starts at rest. `minimax` asks for the least
@@ -219,24 +220,24 @@ class Program:
         high = -low
         free = slice(inner.size, inner.size + len(voltage) - 2)
         low[free], high[free] = q.limits.min_voltage / q.scale, q.limits.max_voltage / q.scale
-        result = self._solver(
+        solution = self._solver(
             x0=np.concatenate(guess), p=path.T.ravel(), lbx=low, ubx=high,
             lbg=self._low, ubg=self._high,
         )  # fmt: skip
         raise_if_stopped()  # which the solver takes for a failure
         stats = self._solver.stats()
-        off = np.maximum(np.array(result["g"]).ravel() - self._high, 0.0)
+        off = np.maximum(np.array(solution["g"]).ravel() - self._high, 0.0)
         if not stats["success"] and not np.max(off) < _FEASIBLE:
             raise NoSolutionError(
                 f"IPOPT found no voltage ({stats['return_status']}). Limits that leave the path no"
                 " room, or a path far beyond the stack's bandwidth, are the likely cause; widen"
                 " the limits or slow the path down."
             )
-        x = np.array(result["x"]).ravel()
+        x = np.array(solution["x"]).ravel()
         return Solution(
             np.concatenate([[q.rest, q.rest], q.scale * x[free]]),
             x[: inner.size].reshape(inner.T.shape).T,
-            np.array(self._outputs(result["x"])),
+            np.array(self._outputs(solution["x"])),
             int(stats["iter_count"]),
             bool(stats["success"]),
         )
@@ -284,13 +285,8 @@ class Program:
         arguments = [self._x, self._path, sigma, multipliers]
         limited = q.minimax or q.limits != AmplifierLimits()  # not only squares shape the answer
         barrier = _BARRIER_LIMITED if limited else _BARRIER
-        options: dict[str, Any] = {
-            "print_time": False,
-            "ipopt": {
-                "print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 150,
-                "mu_init": barrier,
-            },
-        }  # fmt: skip
+        ipopt = {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 150, "mu_init": barrier}
+        options: dict[str, Any] = {"print_time": False, "ipopt": ipopt}
         if not (limited and q.interval.symbolic):
             options["hess_lag"] = ca.Function("hessian", arguments, [hessian])
         goal = cost + self._x[-1] * 100.0 if q.minimax else cost
@@ -303,7 +299,7 @@ WIDTH = 0.02
 #: Solutions after the first, each with the discretisation's error taken off the path.
 CORRECTIONS = 2
 #: A solution that IPOPT did not finish must leave less than this share of the inversion's error.
-_WORTH = 0.8
+_IMPROVEMENT = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,9 +308,9 @@ class TrackedInput:
 
     `response` and `error` are the full simulator's; `predicted` (n,) [m] is what the program itself
     expected at the path's instants. Without `by_program` the answer is the inversion cut by the
-    limits, because the program found none, or none that is better. `width` [V/s] is the rounding of
-    the smooth form, `inverse` the inversion without limits, `iterations` IPOPT's, `seconds` the
-    time it all took.
+    limits, because the program has no solution, or none that is better. `width` [V/s] is the
+    rounding of the smooth form, `inverse` the inversion without limits, `iterations` IPOPT's,
+    `seconds` the time it all took.
     """
 
     target: Target
@@ -364,7 +360,7 @@ def track(
     cut = inverse if bounds == AmplifierLimits() else invert(model, target, bounds)
     guess = cut.response.voltage.copy()
     guess[:2] = rest
-    width = rounding(target, inverse.response.voltage)
+    width = WIDTH * float(np.max(np.abs(inverse.response.rate)))
     smooth = smooth_form(model, width)
     interval = interval_of((equations or dynamics_of)(smooth), symbolic=equations is None)
     problem = Problem(
@@ -392,13 +388,9 @@ def _chosen(
         _, best = min(solutions, key=lambda s: s[0])
         response = respond(model, target.time, best.voltage)
         error = error_of(target, response.displacement)
-        share = 1.0 if best.converged else _WORTH
-        better = (
-            error.largest <= share * cut.error.largest
-            if minimax
-            else error.rms <= share * cut.error.rms
-        )
-        if better or breaks(cut.response, limits):
+        share = 1.0 if best.converged else _IMPROVEMENT
+        designed, inverted = ((e.largest if minimax else e.rms) for e in (error, cut.error))
+        if designed <= share * inverted or breaks(cut.response, limits):
             predicted = np.concatenate([target.displacement[:1], best.displacement[1]])
             return response, error, predicted, True, best.converged
     elif breaks(cut.response, limits):
@@ -407,11 +399,6 @@ def _chosen(
             " slow the path down."
         )
     return cut.response, cut.error, cut.response.displacement, False, False
-
-
-def rounding(target: Target, voltage: FloatArray) -> float:
-    """Return the width of the smooth form [V/s], small against the rates that the path needs."""
-    return WIDTH * float(np.max(np.abs(np.diff(voltage) / np.diff(target.time))))
 
 
 def _rest(model: Model, target: Target, limits: AmplifierLimits) -> tuple[float, FloatArray]:
@@ -438,19 +425,19 @@ def _solve(
     between = scipy.interpolate.PchipInterpolator(target.time, target.displacement)
     path = np.asarray(between(_nodes(target.time)))
     start = problem.start * problem.interval.nominal
-    program, displayed = Program(problem), path
+    program, wanted = Program(problem), path
     inner, _ = _at_nodes(smooth, target.time, guess, start)
     solutions: list[tuple[float, Solution]] = []
     for count in range(corrections + 1):
         progress(f"solution {count + 1} of {corrections + 1}")
         try:
-            result = program.solve(displayed, guess, inner)
+            solution = program.solve(wanted, guess, inner)
         except NoSolutionError:
             break
-        _, reached = _at_nodes(model, target.time, result.voltage, start)
+        _, reached = _at_nodes(model, target.time, solution.voltage, start)
         off = np.abs(reached - path)
         size = np.max(off) if problem.minimax else np.sqrt(np.mean(off**2))
-        solutions.append((float(size), result))
-        guess, inner = result.voltage, result.inner
-        displayed = path - (reached - result.displacement)
+        solutions.append((float(size), solution))
+        guess, inner = solution.voltage, solution.inner
+        wanted = path - (reached - solution.displacement)
     return solutions

@@ -1,4 +1,4 @@
-"""Binary files are read in a process of their own, with limits of time and memory.
+"""Binary files are read in a separate process, with limits of time and memory.
 
 A damaged file may crash the library that reads it, fill the memory or never end. The process gets
 the path and leaves the numbers in a file of a temporary folder: no record passes through a pipe.
@@ -8,7 +8,7 @@ import hashlib
 import json
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import zip_longest
@@ -21,46 +21,24 @@ from psa_casadi.children import end_with_parent, heard, started_python
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import temporary_folder
 from psa_casadi.records.read.columns import MARKS, WORDS, Field, stated_unit
-from psa_casadi.records.read.file_bytes import check_there, read_text
 from psa_casadi.records.read.formats import READERS, ending_of
-from psa_casadi.records.read.samples import Outcome, Request, samples_of
-from psa_casadi.records.read.table import Table, parts_of_file
+from psa_casadi.records.read.samples import Head, Outcome, Request, samples_of
+from psa_casadi.records.read.table import Table, check_there, parts_of_file, read_text
 from psa_casadi.records.read.text import decoded, text_tables
 
 
 @dataclass(frozen=True)
-class Head:
-    """The columns of a table by the names that `--columns` takes, and the first rows.
+class FileTask:
+    """The work of the other process: numbers go to the folder `out`, or `count` rows to the head.
 
-    A name is "" where `--columns` cannot say it. `units` are those that the file states, "" where
-    it states none; `rows` hold the cells as text. `guess` says which column of a record stands
-    where, as the reader takes it or, where it asks, would take it. `tables` are those of the file.
+    `memory` [bytes] is the most that the process may take.
     """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    guess: Mapping[str, Field]
-    tables: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Asked:
-    """What is asked of a file: its numbers in the folder `out`, or `count` rows of its head."""
 
     path: str
     request: Request
     out: str = ""
     count: int = 0
     memory: int = 0
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What the other process tells of a file: its head, or what it holds but for the numbers."""
-
-    outcome: Outcome
-    head: Head | None = None
 
 
 def head_of_tables(path: str, tables: Sequence[Table], count: int, request: Request) -> Head:
@@ -77,13 +55,13 @@ def head_of_tables(path: str, tables: Sequence[Table], count: int, request: Requ
             guess[name] = Field(labels.index(source.array), source.unit or "")
     units = tuple(stated_unit(text) or "" for text in one.header)
     names = tuple("" if MARKS.search(label) else label for label in one.labels)
-    items = [
+    columns = [
         [f"{c:.9g}" for c in cells[:count]]
         if isinstance(cells, np.ndarray) and cells.dtype.kind in "biuf"
         else [str(c)[:40] for c in cells[:count]]
         for cells in one.glance
     ]
-    rows = tuple(zip_longest(*items, fillvalue=""))
+    rows = tuple(zip_longest(*columns, fillvalue=""))
     return Head(names, units, rows, guess, tuple(parts) if len(parts) > 1 else ())
 
 
@@ -106,7 +84,7 @@ def read(path: str, request: Request) -> Outcome:
         tables, digest = text_of(path)
         return replace(samples_of(path, tables, request), sha256=digest)
     with temporary_folder() as folder:
-        outcome = answered_apart(Asked(path, request, str(folder))).outcome
+        outcome = read_apart(FileTask(path, request, str(folder)))
         if outcome.units:
             outcome.values = np.load(folder / "values.npy")
         return outcome
@@ -124,10 +102,10 @@ def head_of(path: str | Path, count: int = 8, table: str = "", names: tuple[str,
     request = Request(table=table, names=names, needed=names or Request.needed)
     if not ending_of(place):
         return head_of_tables(place, text_of(place)[0], count, request)
-    answer = answered_apart(Asked(place, request, count=count))
-    if answer.head is None:
-        raise InputError(answer.outcome.problems)
-    return answer.head
+    outcome = read_apart(FileTask(place, request, count=count))
+    if outcome.head is None:
+        raise InputError(outcome.problems)
+    return outcome.head
 
 
 def text_of(path: str) -> tuple[Sequence[Table], str]:
@@ -145,9 +123,9 @@ def text_of(path: str) -> tuple[Sequence[Table], str]:
     return text_tables(path, text.split("\n"), "line"), digest
 
 
-def answered_apart(requested: Asked) -> Answer:
-    """Return what `answered` does in a process of its own."""
-    path = requested.path
+def read_apart(task: FileTask) -> Outcome:
+    """Return what `read_here` returns, from another process; `values` stay in the folder `out`."""
+    path = task.path
     check_there(path)
     _, package, _ = READERS[ending_of(path)]
     if find_spec(package) is None:
@@ -157,10 +135,10 @@ def answered_apart(requested: Asked) -> Answer:
         )
     size = Path(path).stat().st_size
     limit = _TIME + _TIME_PER_MIB * size / 2**20
-    requested = replace(requested, memory=_MEMORY + _MEMORY_PER_BYTE * size)
+    task = replace(task, memory=_MEMORY + _MEMORY_PER_BYTE * size)
     try:
         with started_python(
-            _MODULE, json.dumps(msgspec.to_builtins(requested)),
+            _MODULE, json.dumps(msgspec.to_builtins(task)),
             OPENBLAS_NUM_THREADS="1", ARROW_DEFAULT_MEMORY_POOL="system",
         ) as child:  # fmt: skip
             done = heard(child, limit=limit)
@@ -169,67 +147,59 @@ def answered_apart(requested: Asked) -> Answer:
     if done.returncode:
         why = "the library that reads it fails, or needs more memory than such a file may"
         return _unreadable(path, why)
-    return answer_in(done.stdout.splitlines()[-1])
+    return from_json(done.stdout.splitlines()[-1])
 
 
-def text_in(answer: Answer) -> str:
-    """Return an answer in JSON, without the numbers."""
-    return json.dumps(msgspec.to_builtins(answer, enc_hook=lambda _: None))
+def to_json(outcome: Outcome) -> str:
+    """Return an outcome as JSON, without its `values`."""
+    return json.dumps(msgspec.to_builtins(outcome, enc_hook=lambda _: None))
 
 
-def answer_in(text: str | bytes) -> Answer:
-    """Return the answer that a text in JSON is."""
-    none = np.zeros((0, 0))
-    return msgspec.convert(json.loads(text), Answer, dec_hook=lambda *_: none)
+def from_json(text: str | bytes) -> Outcome:
+    """Return the outcome that `to_json` wrote; it has no `values`."""
+    return msgspec.convert(json.loads(text), Outcome, dec_hook=lambda *_: np.zeros((0, 0)))
 
 
-def _unreadable(path: str, why: str) -> Answer:
-    """Return that a file is damaged."""
+def _unreadable(path: str, why: str) -> Outcome:
+    """Return the outcome of a damaged file."""
     *_, kind = READERS[ending_of(path)]
-    return _refused(
-        f"{path}: is no readable {kind} file ({why}); save it again, or export the record as CSV."
-    )
+    problem = f"is no readable {kind} file ({why}); save it again, or export the record as CSV."
+    return Outcome((f"{path}: {problem}",))
 
 
-def _refused(*problems: str) -> Answer:
-    return Answer(Outcome(problems))
-
-
-def answered(requested: Asked) -> Answer:
-    """Return what is told of a file, read in this process."""
-    path = requested.path
+def read_here(task: FileTask) -> Outcome:
+    """Return what is read of a file in this process, or the problems that it has."""
+    path = task.path
     try:
         tables = READERS[ending_of(path)][0](path)
-        if requested.count:
-            return Answer(
-                Outcome(), head_of_tables(path, tables, requested.count, requested.request)
-            )
-        outcome = samples_of(path, tables, requested.request)
+        if task.count:
+            return Outcome(head=head_of_tables(path, tables, task.count, task.request))
+        outcome = samples_of(path, tables, task.request)
     except InputError as error:
-        return _refused(*error.problems)
+        return Outcome(error.problems)
     except MemoryError:
-        return _refused(f"{path}: needs more memory than a record may; split it.")
+        return Outcome((f"{path}: needs more memory than a record may; split it.",))
     except Exception as error:  # noqa: BLE001 - a library may raise anything on a damaged file
-        statement = str(error).splitlines()
-        return _unreadable(path, statement[0][:120] if statement else type(error).__name__)
+        lines = str(error).splitlines() or [type(error).__name__]
+        return _unreadable(path, lines[0][:120])
     with Path(path).open("rb") as stream:
         outcome.sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
     if outcome.units:
-        np.save(Path(requested.out) / "values.npy", outcome.values)
-    return Answer(outcome)
+        np.save(Path(task.out) / "values.npy", outcome.values)
+    return outcome
 
 
 def main() -> None:
-    """Answer what is asked on the command line on standard output, in JSON."""
+    """Do the task on the command line; write the outcome to standard output, in JSON."""
     end_with_parent()
-    value = msgspec.convert(json.loads(sys.argv[1]), Asked)
+    task = msgspec.convert(json.loads(sys.argv[1]), FileTask)
     if sys.platform != "win32":
         import resource  # noqa: PLC0415
 
         hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        limit = value.memory if hard == resource.RLIM_INFINITY else min(value.memory, hard)
+        limit = task.memory if hard == resource.RLIM_INFINITY else min(task.memory, hard)
         resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
-    sys.stdout.write(f"\n{text_in(answered(value))}\n")
+    sys.stdout.write(f"\n{to_json(read_here(task))}\n")
 
 
 if __name__ == "__main__":

@@ -11,13 +11,13 @@ import numpy as np
 
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import (
+    COLUMN_OF,
     SI_UNITS,
     WORDS,
     ColumnMap,
     Field,
     Source,
     check_unit,
-    column_named,
     measures,
     mismatch,
     name_and_unit,
@@ -33,12 +33,12 @@ from psa_casadi.records.read.table import Table, as_numbers, as_times, evened
 from psa_casadi.records.record import COLUMNS
 from psa_casadi.units import parse_unit
 
-#: The quantities that tell the columns which every record has.
+#: The quantities of the columns that every record has.
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}
-#: What `--columns` takes for its own marks in a name, where a unit follows.
+#: Marks of `--columns`, which a name may not hold if a unit follows.
 _MARKS = set(",[]")
 #: Words for what is commanded and for what drives, for what is measured, and for neither; for what
-#: only says when, and for what only counts.
+#: only marks an instant, and for what only counts.
 _COMMANDED, _DRIVING, _MEASURED, _NEITHER, _MARKING, _COUNTING = (
     set(WORDS["roles"][role])
     for role in ("commanded", "driving", "measured", "neither", "marking", "counting")
@@ -69,7 +69,7 @@ class Cell:
 
     def speaks(self, column: str) -> int:
         """Return 1 where the words of the name speak for a column, -1 against it, else 0."""
-        meant = {column_named(word) for word in self.words} - {None}
+        meant = {COLUMN_OF[word] for word in self.words if word in COLUMN_OF}
         if meant - {column} or self.words & (_AGAINST.get(column, set()) | _MARKING):
             return -1
         return 1 if meant or self.words & _FOR.get(column, set()) else 0
@@ -84,23 +84,19 @@ class Cell:
         in_volts = column == "displacement" and measures("voltage", self.hint)
         return 6 - number if in_volts and not self.words & _FOR["voltage"] else None
 
-    def source(self, column: str) -> Source:
-        """Return it as the source of a column, in its own unit or the usual one."""
-        return usual_source(column, self.label, self.hint)
-
     @property
     def channel(self) -> str:
         """The number at the end of a name without unit, "" without one."""
         return self.text[len(self.text.rstrip("0123456789")) :] if self.unit is None else ""
 
     def misspelled(self, absent: Sequence[str]) -> str:
-        """Return the column whose own name it has with a mistake, "" where it has none."""
-        cutoff = 0.9 if any(map(column_named, self.words)) else 0.8
+        """Return the column whose canonical name it has with a mistake, "" without one."""
+        cutoff = 0.8 if self.words.isdisjoint(COLUMN_OF) else 0.9
         near = difflib.get_close_matches(plain(self.label), absent, n=1, cutoff=cutoff)
         return near[0] if near else ""
 
 
-#: What an option says that is offered for what is open.
+#: What to do with the option that is offered for an open question.
 ASK_COLUMN, ASK_UNIT = "say which column it is", "say which, and in which unit"
 _ASK_SCALE = "say what 1 in the file is"
 
@@ -116,10 +112,9 @@ class Question(NamedTuple):
 class Choice:
     """The columns that the header of a table names for sure: `fields`.
 
-    `open` is what it leaves open, `sources` what is suggested for that. `wanted` says which name,
-    or which column counted from 1, stands for which column where the header does not use the
-    columns' own names. Added to `problems`: columns misspelled or there twice, units that are
-    wrong, names in `wanted` that the table does not have.
+    `open` is what it leaves open, `sources` what is suggested for that. `wanted` maps columns of
+    the record to names in the header, or to numbers counted from 1. Added to `problems`: columns
+    misspelled or there twice, units that are wrong, names in `wanted` that the table does not have.
     """
 
     def __init__(
@@ -132,13 +127,13 @@ class Choice:
         if table.headless and not wanted:
             self._count()
             return
-        self._take_own_names()
+        self._take_canonical_names()
         unclear = self._take_other_names()
         self._ask(unclear, self._complain())
         self.sources = {**wanted, **self.sources} if self.sources else {}
 
     def _count(self) -> None:
-        """Say what can be said of a table without a header: its columns are counted."""
+        """Suggest columns of a table without a header by their numbers."""
         table, required = self.table, self.required
         free = [k for k in range(len(table.header)) if not table.sizes or table.sizes[k] > 1]
         time = next((k for k in free if rises(table, k)), None) if "time" in required else None
@@ -149,18 +144,18 @@ class Choice:
         text = f"{table.where}: found '{table.headless[:60]}', expected a header"
         self.open.append(Question(text, ASK_UNIT, f"write a first line such as '{example}'"))
 
-    def _take_own_names(self) -> None:
-        """Take the cells with the columns' own names and units, and those that were asked for."""
+    def _take_canonical_names(self) -> None:
+        """Take the cells with the columns' canonical names and units, and those of `--columns`."""
         table, wanted = self.table, self.wanted
         places = {place_of(wanted[name].array, table): name for name in reversed(list(wanted))}
         first = any(plain(label).replace("_", "") == "displacement1" for label in table.labels)
         last = last_name if table.sizes else str
         for index, text in enumerate(table.header):
-            requested, (item, unit) = index in places, name_and_unit(text)
-            name = places.get(index, plain(item))
-            bare = unit is None and (name in self.required or name == "time")
+            requested, (bare, unit) = index in places, name_and_unit(text)
+            name = places.get(index, plain(bare))
+            open_unit = unit is None and (name in self.required or name == "time")
             second = name == "displacement_2" and first
-            if name not in COLUMNS or (not requested and (bare or second or name in wanted)):
+            if name not in COLUMNS or (not requested and (open_unit or second or name in wanted)):
                 self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
                 self.problems.add(
@@ -168,15 +163,14 @@ class Choice:
                     f" as column {self.fields[name].index + 1}); rename or remove one of the two."
                 )
             else:
-                place = f"column '{item if requested else name}'"
-                unit = unit or (unit_for(name, last_name(item)) if requested else None)
+                place = f"column '{bare if requested else name}'"
+                unit = unit or (unit_for(name, last_name(bare)) if requested else None)
                 if table.sizes and requested and wanted[name].unit:  # of an array it is often wrong
                     unit = None
                 is_unit = unit is not None and unit_named(unit, common=False) is not None
                 if not requested and unit and is_unit and not measures(name, unit):
-                    self._ask_scale(
-                        name, unit, place, usual_source(name, table.labels[index], unit)
-                    )
+                    source = usual_source(name, table.labels[index], unit)
+                    self._ask_scale(name, unit, place, source)
                 else:
                     unit = self._agreed_unit(name, unit, f"{table.where}, {place}")
                 self.fields[name] = Field(index, unit or "")
@@ -184,7 +178,7 @@ class Choice:
     def _take_other_names(self) -> dict[str, list[Cell]]:
         """Take the cells with a laboratory's name for a column, or the unit that only one has.
 
-        What has a column's own name misspelled is nothing else. Returns the cells that may be a
+        A misspelled canonical name is no other column. Returns the cells that may be a
         column by its name.
         """
         absent = [n for n in COLUMNS if n not in self.fields]
@@ -200,8 +194,8 @@ class Choice:
                 unclear[column] = may_be
             else:
                 if cell.unit is not None and not measures(column, cell.unit):
-                    place = f"column '{cell.text}'"
-                    self._ask_scale(column, cell.unit, place, cell.source(column))
+                    source = usual_source(column, cell.label, cell.hint)
+                    self._ask_scale(column, cell.unit, f"column '{cell.text}'", source)
                 taken.append(cell)
             self.fields[column] = Field(cell.index, cell.unit or SI_UNITS.get(column, "um"))
         self.left = [cell for cell in self.left if cell not in taken]
@@ -228,8 +222,7 @@ class Choice:
 
     def _ask(self, unclear: Mapping[str, Sequence[Cell]], missing: Sequence[str]) -> None:
         """Ask for the columns that are unclear or missing, and suggest what they may be."""
-        where, output = self.table.where, []
-        in_header = not self.table.sizes
+        where, in_header, questions = self.table.where, not self.table.sizes, list[Question]()
         if unclear:
             which = ", ".join(
                 f"'{name}' {'has no unit' if len(item) == 1 else 'may be more than one column'}"
@@ -238,15 +231,15 @@ class Choice:
             )
             examples = ", ".join(f"'{COLUMNS[name].example}'" for name in unclear)
             cure = f"write {examples} in the header" if in_header else ""
-            output.append(Question(f"{where}: {which}", ASK_UNIT, cure))
+            questions.append(Question(f"{where}: {which}", ASK_UNIT, cure))
         listed = self._listed([name for name in self.fields if name not in unclear])
         for name in missing:
             cure = f"add it to the header as '{COLUMNS[name].example}'" if in_header else ""
             what = f"{where}: the column '{name}' is missing (found: {listed})"
-            output.append(Question(what, ASK_COLUMN, cure))
-        self.open = [*output, *self.open]
+            questions.append(Question(what, ASK_COLUMN, cure))
+        self.open = [*questions, *self.open]
         chosen = self._suggested([*unclear, *missing])
-        self.sources |= {name: cell.source(name) for name, cell in chosen.items()}
+        self.sources |= {n: usual_source(n, c.label, c.hint) for n, c in chosen.items()}
         length = chosen.get("displacement")
         if length is not None and length.hint is None:  # a stroke that a stack may have
             cells = as_numbers(self.table.glance[length.index])
@@ -292,7 +285,7 @@ class Choice:
             return inputs or ""
         unit = text or inputs or (SI_UNITS.get(name) if source else None)
         check_unit(COLUMNS[name], unit, where, self.problems)
-        with suppress(InputError):  # an unknown one was told already
+        with suppress(InputError):  # an unknown one is reported already
             units = {replace(parse_unit(u), name="", quantity="") for u in (text, inputs) if u}
             if len(units) < 2:
                 return unit or ""
@@ -321,9 +314,9 @@ class Choice:
 def _cell_of(text: str, label: str, index: int) -> Cell:
     """Return the cell that a text is."""
     name, unit, hint = understood(text), stated_unit(text), stated_unit(text, loosely=True)
-    is_near = hint is not None and parse_unit(hint).quantity in QUANTITIES.values()
-    column = None if name is None else name.column
-    return Cell(index, label, text, unit, hint if unit or is_near else None, column, words_of(text))
+    if unit is None and hint and parse_unit(hint).quantity not in QUANTITIES.values():
+        hint = None
+    return Cell(index, label, text, unit, hint, name.column if name else None, words_of(text))
 
 
 def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list[Cell], bool]:
@@ -335,25 +328,25 @@ def _decided(column: str, cells: Sequence[Cell], *, by_unit: bool) -> tuple[list
     """
     named = [c for c in cells if c.column == column]
     quantity = QUANTITIES.get(column, "none") if by_unit else "none"
-    items = [
+    by_quantity = [
         c for c in cells
         if c.column is None and c.unit is not None and c.speaks(column) >= 0
         and parse_unit(c.unit).quantity == quantity
     ]  # fmt: skip
     stating = [c for c in named if c.unit is not None]
     stating = [c for c in stating if measures(column, c.unit or "")] or stating
-    commanded = [c for c in items if column == "voltage" and c.words & _COMMANDED]
+    commanded = [c for c in by_quantity if column == "voltage" and c.words & _COMMANDED]
     if len(stating) == 1 and not commanded:
         return stating, True
     if named:
-        return [*named, *items], False
+        return [*named, *by_quantity], False
     others = [c for c in cells if c.column is None and c.hint is None]
-    rivals = [c for c in others if c.speaks(column) > 0] if items else []
-    return [*items, *rivals], len(items) == 1 and not rivals
+    rivals = [c for c in others if c.speaks(column) > 0] if by_quantity else []
+    return [*by_quantity, *rivals], len(by_quantity) == 1 and not rivals
 
 
 def with_usual_units(table: Table) -> Table:
-    """Return a table of arrays in which those with a column's own name have its SI unit.
+    """Return a table of arrays in which those with a column's canonical name have its SI unit.
 
     A displacement has none, nor has what states its unit.
     """
@@ -368,8 +361,7 @@ def rises(table: Table, index: int) -> bool:
     """Whether a column is one of instants, or of numbers each of which is larger than the last."""
     cells = table.glance[index]
     times = as_times(cells, "s")
-    if times is None:
-        times = as_numbers(cells, "s")
+    times = as_numbers(cells, "s") if times is None else times
     if times.size < 2:
         return False
     steps = np.diff(times)
@@ -389,9 +381,9 @@ def place_of(array: str, table: Table) -> int | None:
     """Return the index of the column that `--columns` names: by its name, its text, its number."""
     meant = plain(array)
     for texts in (table.labels, table.header, [last_name(label) for label in table.labels]):
-        items = [k for k, text in enumerate(texts) if plain(text) == meant]
-        if items:
-            return items[0]
+        for k, text in enumerate(texts):
+            if plain(text) == meant:
+                return k
     k = int(array) - 1 if array.isdecimal() and len(array) < 6 else -1
     return k if 0 <= k < len(table.header) else None
 
@@ -405,8 +397,8 @@ def last_name(label: str) -> str:
 class ByName:
     """The columns of a table that are the time and the inputs and outputs of a model: `fields`.
 
-    A name is found whatever its case, its spaces and underscores, and the unit behind it; none is
-    guessed from its unit. `names` are the model's, `required` what must be there.
+    Names are compared without case, spaces, underscores and the unit behind them; none is guessed
+    from its unit. `names` are the model's, `required` what must be there.
     The unit of a field is "" where the table states none, but that of the time "s". `unread` are
     the labels of other columns where a name is missing. `open`,
     `sources`, `wanted` and `problems` are those of `Choice`.
@@ -423,15 +415,14 @@ class ByName:
         self.table, self.names, self.problems = table, ("time", *names), problems
         self.open, self.sources = list[Question](), dict[str, Source]()
         fields: dict[str, Field] = {}
-        self._take_asked(fields, wanted)
+        self._take_wanted(fields, wanted)
         self._take_named(fields)
         if "time" not in fields and (time := self._time(fields)) is not None:
             fields["time"] = time
         self.fields = {name: fields[name] for name in self.names if name in fields}
         self.unread = self._others(fields) if len(fields) < len(self.names) else ()
-        if "time" in fields:
-            where = f"{table.where}, column 'time'"
-            check_unit(COLUMNS["time"], fields["time"].unit, where, problems)
+        if time := fields.get("time"):
+            check_unit(COLUMNS["time"], time.unit, f"{table.where}, column 'time'", problems)
         for name in [n for n in required if n not in fields and n not in wanted]:
             self._ask(name)
         if self.open and table.headless:
@@ -440,7 +431,7 @@ class ByName:
             self.open = [Question(text, ASK_UNIT, f"write a first line such as '{example}'")]
         self.sources = {**wanted, **self.sources} if self.sources else {}
 
-    def _take_asked(self, fields: dict[str, Field], wanted: ColumnMap) -> None:
+    def _take_wanted(self, fields: dict[str, Field], wanted: ColumnMap) -> None:
         """Take what `--columns` names; its unit and that of the header must not disagree."""
         for name, source in wanted.items():
             index = place_of(source.array, self.table)
@@ -464,15 +455,15 @@ class ByName:
         requested = set(fields)
         taken = {field.index for field in fields.values()}
         forms = [
-            (rank, text != name, name, index, unit)
+            ((rank, text != name), name, index, unit)
             for index in self._cells()
             for rank, (text, unit) in enumerate(names_and_units(self._text(index)))
             for name in self.names
             if _key(text) == _key(name)
         ]
         ranks: dict[str, tuple[int, bool]] = {}
-        for rank, other_case, name, index, unit in sorted(forms, key=lambda form: form[:2]):
-            if name in fields and (name in requested or ranks[name] != (rank, other_case)):
+        for rank, name, index, unit in sorted(forms, key=lambda form: form[0]):
+            if name in fields and (name in requested or ranks[name] != rank):
                 continue
             if name in fields and index not in taken:
                 self.problems.add(
@@ -480,17 +471,14 @@ class ByName:
                     f" (first as column {fields[name].index + 1}); rename or remove one of the two."
                 )
             elif index not in taken:
-                fields[name], ranks[name] = (
-                    Field(index, unit or self._usual(name)),
-                    (rank, other_case),
-                )
+                fields[name], ranks[name] = Field(index, unit or self._usual(name)), rank
                 taken.add(index)
 
     def _time(self, fields: Mapping[str, Field]) -> Field | None:
         """Return a cell with another name for the time, whose values rise."""
         taken = {field.index for field in fields.values()}
-        for index in self._cells():
-            meant = understood(self._text(index)) if index not in taken else None
+        for index in (k for k in self._cells() if k not in taken):
+            meant = understood(self._text(index))
             if meant is not None and meant.column == "time" and rises(self.table, index):
                 return Field(index, meant.unit or "s")
         return None

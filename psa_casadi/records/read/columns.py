@@ -1,4 +1,4 @@
-"""What headers mean: columns by name and unit, and `--columns`, which says it in their place."""
+"""What headers mean: columns by name and unit, and `--columns`, which overrides them."""
 
 import difflib
 import os
@@ -16,7 +16,7 @@ from psa_casadi.units import UNITS, parse_unit, units_of
 
 @dataclass(frozen=True)
 class Field:
-    """Where a column stands in the file, and the unit its numbers have."""
+    """The place of a column in the file, and the unit of its numbers."""
 
     index: int
     unit: str
@@ -24,10 +24,9 @@ class Field:
 
 @dataclass(frozen=True)
 class Source:
-    """The array that holds a column, and its unit; None where the file or the column says it.
+    """The array that holds a column, and its unit; None if the file or the column implies it.
 
-    A `scale` that is given says what 1 in the file is: 10 with the unit um is 10 um, as of a
-    sensor's volts.
+    A `scale` is what 1 in the file is: 10 with the unit um is 10 um, as of a sensor's volts.
     """
 
     array: str
@@ -51,7 +50,7 @@ def ready_line(sources: ColumnMap, sample_time: float | None = None, table: str 
     """Return the options that say which array is which column, and the sample time, for a shell."""
     named = [f"table={table}"] if table else []
     line = ",".join([*named, *(f"{name}={source}" for name, source in sources.items())])
-    if os.name == "nt" or _SPECIAL.search(line):  # PowerShell takes a comma for its own
+    if os.name == "nt" or _SPECIAL.search(line):  # a comma is an operator of PowerShell
         line = f'"{line}"'
     options = [f"--columns {line}"] if line else []
     options += [f"--sample-time {sample_time:g}"] if sample_time is not None else []
@@ -79,11 +78,10 @@ def measures(name: str, unit: str) -> bool:
         parsed = parse_unit(unit)
     except InputError:
         return False
-    item = COLUMNS[name].quantities
-    return parsed.quantity in item or (
-        not parsed.quantity
-        and any(parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in item)
-    )
+    quantities = COLUMNS[name].quantities
+    if parsed.quantity:
+        return parsed.quantity in quantities
+    return any(parsed.dimension == parse_unit(units_of(q)[0]).dimension for q in quantities)
 
 
 _SPECIAL = re.compile(r"[^\w.,=:+/%@-]")
@@ -114,7 +112,7 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
         problems.add(f"{where}: {'; '.join(mismatch(column, unit))}.")
 
 
-#: What stands for the choice of a table among the names of columns.
+#: The key that chooses a table among the names of columns.
 TABLE = "table"
 #: Its value that takes each table of a file as a record.
 ALL = "all"
@@ -129,16 +127,16 @@ _FORM = "write NAME=ARRAY:UNIT, several joined by commas, such as time=t:ms,disp
 
 
 def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
-    """Return what `NAME=ARRAY:UNIT,...` says (`NAME=ARRAY[UNIT]` is read too).
+    """Return the sources in `NAME=ARRAY:UNIT,...` (`NAME=ARRAY[UNIT]` is read too).
 
     NAME is a column of a record. ARRAY is a column's name in the header of a CSV or Parquet file,
     or a MATLAB array: a field of a structure is written `log.u`, the second column of a matrix
-    `m.2`. Without UNIT the header's own unit counts, else the SI unit; a displacement is never
-    guessed. A number before UNIT says what 1 in the file is, whatever the header says: `10um` for
-    the volts of a sensor of 10 um/V. `FILE@NAME=ARRAY:UNIT` is said of one file by its name.
+    `m.2`. Without UNIT the header's unit counts, else the SI unit; a displacement is never
+    guessed. A number before UNIT is what 1 in the file is, whatever the header states: `10um` for
+    the volts of a sensor of 10 um/V. `FILE@NAME=ARRAY:UNIT` holds for one file by its name.
     `table=NAME` takes one of several tables of a file (sheets, groups, blocks, segments of time) by
     its name or number, `table=all` each as a record. `names` are the columns of a record on any
-    model beside the time; without them it is one of a stack.
+    model besides the time; without them it is one of a stack.
 
     Raises:
         InputError: every part that is not of this form, names no column or no unit of it.
@@ -153,8 +151,8 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
         if match is None or not match["array"].strip():
             problems.add(f"{where}: is not understood; {_FORM}.")
             continue
-        file, at, item = match["name"].strip().rpartition("@")
-        name = of_key.get(item.strip()) or of_key.get(_key(item)) or _key(item)
+        file, at, column = match["name"].strip().rpartition("@")
+        name = of_key.get(column.strip()) or of_key.get(_key(column)) or _key(column)
         key = f"{file.strip()}{at}{name}"
         unit = match["unit"] if match["in"] is None else match["in"]
         if name == TABLE:
@@ -181,13 +179,13 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
 
 
 def columns_of(wanted: ColumnMap, file: str) -> ColumnMap:
-    """Return what is said of one file: by its name, else what is said of all."""
-    table = {k.removeprefix(f"{file}@"): v for k, v in wanted.items() if k.startswith(f"{file}@")}
-    return table or {k: v for k, v in wanted.items() if "@" not in k}
+    """Return the sources of one file: those with its name, else those of all files."""
+    of_file = {k.removeprefix(f"{file}@"): v for k, v in wanted.items() if k.startswith(f"{file}@")}
+    return of_file or {k: v for k, v in wanted.items() if "@" not in k}
 
 
 def files_named(wanted: ColumnMap) -> set[str]:
-    """Return the names of the files of which something is said."""
+    """Return the names of the files that have separate sources."""
     return {key.rpartition("@")[0] for key in wanted if "@" in key}
 
 
@@ -208,9 +206,10 @@ _UNIT_OF = {
 } | WORDS["units"]
 #: What names the place of a channel behind the quantity: `Current Position of axis 1`.
 _OF_A_PLACE = re.compile(r" of [\w ]*?(axis|chan|channel)\s*:?\s*\w+$")
-_COLUMN_OF = {alias: name for name, aliases in WORDS["columns"].items() for alias in aliases}
+#: The column that a word names by itself.
+COLUMN_OF = {alias: name for name, aliases in WORDS["columns"].items() for alias in aliases}
 #: With a unit behind it, a symbol that is a unit itself is a name too: `s/um`.
-_WITH_UNIT = _COLUMN_OF | {"s": "displacement"}
+_WITH_UNIT = COLUMN_OF | {"s": "displacement"}
 #: A name and its unit: in brackets of any form, after a slash, comma, underscore or space.
 _FORMS = (
     re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]*)[\])}]"),
@@ -224,7 +223,7 @@ _CHANNEL = re.compile(r"(?<=\w)[ _]?\d+$")
 #: A clock time is written in the place of the unit: `[hh:mm:ss.fff]`.
 _CLOCK = re.compile(r"[ymd./ -]*h{1,2}:m{1,2}(:s{1,2}([.,:][sf0]+)?)?", re.I)
 _WORD = re.compile(r"[^\W\d_]{2,}")
-#: What stands in a row of units where a column has none.
+#: What a row of units has for a column without one.
 _NO_UNIT = ("-", "\N{EN DASH}")
 
 
@@ -247,14 +246,13 @@ class _Part:
 
 
 def understood(text: str) -> Name | None:
-    """Return what a header cell stands for, or None where it is no column of a record.
+    """Return what a header cell means, or None if it is no column of a record.
 
     What follows an underscore or a space may belong to the name: `U_amp` and `V_min` are in no
     ampere and no minute.
     """
     name = _plain(text)
-    whole = _COLUMN_OF.get(name) or _COLUMN_OF.get(_CHANNEL.sub("", name))
-    if whole is not None:
+    if whole := COLUMN_OF.get(name) or COLUMN_OF.get(_CHANNEL.sub("", name)):
         return Name(whole, None)
     for part in _parts(text):
         column = _WITH_UNIT.get(_plain(part.name))
@@ -290,7 +288,7 @@ def name_and_unit(text: str) -> tuple[str, str | None]:
 def names_and_units(text: str) -> Iterator[tuple[str, str | None]]:
     """Yield what may be the name and the unit in a cell: the whole, then by every form that fits.
 
-    What stands in square brackets is a unit, known or not.
+    Text in square brackets is a unit, known or not.
     """
     yield _unquoted(text), None
     name, unit = name_and_unit(_unquoted(text))
@@ -323,11 +321,6 @@ def words_of(text: str) -> frozenset[str]:
     parts = [part.name for part in _parts(text) if part.is_sure]
     name = (parts[0] if parts else text).rstrip("/").rpartition("/")[2]
     return frozenset(_WORD.findall(name.lower()))
-
-
-def column_named(word: str) -> str | None:
-    """Return the column that a word is a name of, alone."""
-    return _COLUMN_OF.get(word)
 
 
 def _parts(text: str) -> Iterator[_Part]:
@@ -389,7 +382,7 @@ def unit_named(text: str, *, common: bool = True) -> str | None:
 def units_row(cells: Sequence[str]) -> list[str] | None:
     """Return the units that a row below the names gives, in brackets or bare; None if it is none.
 
-    Every cell that is filled must be a unit, and two at least; a dash stands for none.
+    Every cell that is filled must be a unit, and two at least; a dash means none.
     """
     bare = [_unquoted(c).strip("[](){}").strip() for c in cells]
     bare = ["" if c in _NO_UNIT else c for c in bare]

@@ -1,6 +1,6 @@
 """Files of other programs, read by the libraries that the field reads them with.
 
-Each reader returns the tables of the file at a path. It runs in a process of its own
+Each reader returns the tables of the file at a path. It runs in a separate process
 (`records.read.apart`), since what is damaged may crash a library or fill the memory.
 """
 
@@ -27,8 +27,7 @@ from psa_casadi.records.read.columns import (
     understood,
     unit_named,
 )
-from psa_casadi.records.read.file_bytes import check_size
-from psa_casadi.records.read.table import Cells, Columns, Table, unit_of_times
+from psa_casadi.records.read.table import Cells, Columns, Table, check_size, unit_of_times
 from psa_casadi.records.read.text import stated_step, text_tables
 
 #: The attributes and properties that state a unit, in lower case.
@@ -46,12 +45,12 @@ class Series:
 
     @property
     def text(self) -> str:
-        """The name with its unit: the stated one, or that of a name of its own."""
+        """The name with its unit: the stated one, or that which the values or the name imply."""
         last = self.name.rpartition(".")[2]
-        item = last if re.match(r"\w*[^\W\d]", last) else self.name
+        label = last if re.match(r"\w*[^\W\d]", last) else self.name
         unit = self.unit
-        if unit is None and not stated_unit(item):
-            name = understood(item)
+        if unit is None and not stated_unit(label):
+            name = understood(label)
             values = self.values()[:9] if name and name.column == "time" and self.size > 1 else []
             if isinstance(values, np.ndarray) and len(values):
                 is_instant = values.dtype.kind in "mM"
@@ -80,19 +79,19 @@ def series_in(name: str, numbers: NDArray[Any], unit: object = None) -> Iterator
 
 
 def array_tables(
-    path: str, result: Iterable[Series], stated: Iterable[str] = (), place: str = "sample"
+    path: str, arrays: Iterable[Series], stated: Iterable[str] = (), place: str = "sample"
 ) -> list[Table]:
     """Return the tables that series make: all of them, then those of each group with several.
 
     A group is also what the columns of one number of several matrices are; what is in none, such as
     a time, belongs to each.
 
-    The first of a name counts. `stated` are lines such as "fs = 1000" that a file has beside them.
+    The first of a name counts. `stated` are lines such as "fs = 1000" that a file states elsewhere.
     """
     named: dict[str, Series] = {}
-    for one in result:
-        item, bracketed = name_and_unit(one.name)
-        name = MARKS.sub("_", item or one.name.strip())
+    for one in arrays:
+        bare, bracketed = name_and_unit(one.name)
+        name = MARKS.sub("_", bare or one.name.strip())
         unit = unit_named(one.unit, common=False) if isinstance(one.unit, str) else None
         unit = unit or (bracketed.strip() if bracketed else None)
         named.setdefault(name, replace(one, name=name, unit=unit))
@@ -100,12 +99,10 @@ def array_tables(
     scalars = {n.rpartition(".")[2]: s.values() for n, s in named.items() if s.size == 1}
 
     def load(numbers: Sequence[int], most: int | None, _: Problems) -> Columns:
-        check_size(
-            path, 8 * sum(series[k].size for k in numbers if most is None), "its columns hold"
-        )
+        if most is None:
+            check_size(path, 8 * sum(series[k].size for k in numbers), "its columns hold")
         cells = [series[k].values()[: most or series[k].size] for k in numbers]
-        longest = max(map(len, cells), default=0)
-        return Columns(cells, np.arange(1, longest + 1))
+        return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
     whole = Table(
         path=path, name="", header=[one.text for one in series], labels=labels,
@@ -138,33 +135,32 @@ def _unit_in(properties: Mapping[str, Any]) -> object:
 def hdf5_tables(path: str) -> list[Table]:
     """Return the tables of an HDF5 file: datasets, fields of tables, units and time by attributes.
 
-    A dataset in a group is named `group.dataset`. The attribute `units` or `unit` says the unit; a
+    A dataset in a group is named `group.dataset`. The attribute `units` or `unit` is the unit; a
     sample time [s] or rate [Hz] among the attributes the time where no dataset has it.
     """
     import h5py  # noqa: PLC0415
 
     with h5py.File(path, "r") as file:
         held = list(checked_datasets(path, file, set()))
-        items = [s for item in held for s in _of_dataset(path, item)]
+        series = [s for item in held for s in _of_dataset(path, item)]
         about = [file, *held, *(item.parent for item in held)]
         stated = [line for item in about for line in statements(_attributes(item))]
-    return array_tables(path, items, stated)
+    return array_tables(path, series, stated)
 
 
 def _of_dataset(path: str, item: Any) -> Iterator[Series]:
     import h5py  # noqa: PLC0415
 
-    name = item.name.strip("/").replace("/", ".")
-    unit = _unit_in(_attributes(item))
-    place, size = item.name, max(item.shape or (0,))
+    if not item.shape:
+        return
+    place, name = item.name, item.name.strip("/").replace("/", ".")
+    unit, size = _unit_in(_attributes(item)), max(item.shape)
 
     def read() -> Any:
         with h5py.File(path, "r") as file:
-            result = file[place]
-            return result.asstr()[()].ravel().tolist() if result.dtype.kind == "O" else result[()]
+            data = file[place]
+            return data.asstr()[()].ravel().tolist() if data.dtype.kind == "O" else data[()]
 
-    if not item.shape:
-        return
     if sum(n != 1 for n in item.shape) == 1 and item.dtype.kind in "biuf":
         yield Series(name, size, lambda: np.ravel(read()), unit)
     elif item.dtype.kind in "biufV":
@@ -182,37 +178,34 @@ def checked_datasets(path: str, group: Any, numbers: set[int]) -> list[Any]:
     if address in numbers:
         raise ValueError(f"the group '{group.name}' is reached twice")
     numbers.add(address)
-    items = []
+    datasets = []
     for name in group:
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
-        item = group[name]
-        if isinstance(item, h5py.Group):
-            items += checked_datasets(path, item, numbers)
-        elif isinstance(item, h5py.Dataset) and item.shape is not None:
-            if item.external or item.is_virtual:
+        child = group[name]
+        if isinstance(child, h5py.Group):
+            datasets += checked_datasets(path, child, numbers)
+        elif isinstance(child, h5py.Dataset) and child.shape is not None:
+            if child.external or child.is_virtual:
                 raise InputError(
-                    f"{path}: the array '{item.name}' lies in another file; save the values"
+                    f"{path}: the array '{child.name}' lies in another file; save the values"
                     " themselves."
                 )
-            if item.chunks:
-                piece = math.prod(item.chunks) * item.dtype.itemsize
-                check_size(path, piece, f"a piece of the array '{item.name}' holds")
-            items.append(item)
-    return items
+            if child.chunks:
+                piece = math.prod(child.chunks) * child.dtype.itemsize
+                check_size(path, piece, f"a piece of the array '{child.name}' holds")
+            datasets.append(child)
+    return datasets
 
 
 def _attributes(item: Any) -> dict[str, Any]:
     """Return the attributes with their keys in lower case, texts as such."""
-    table = {}
-    for key in item.attrs:
-        value = item.attrs[key]
-        if isinstance(value, np.ndarray) and value.size == 1:
-            value = value.reshape(-1)[0]
-        table[str(key).lower()] = (
-            value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-        )
-    return table
+    attributes = {}
+    for key, value in item.attrs.items():
+        one = value.flat[0] if isinstance(value, np.ndarray) and value.size == 1 else value
+        text = one.decode(errors="replace") if isinstance(one, bytes) else one
+        attributes[str(key).lower()] = text
+    return attributes
 
 
 def matlab_tables(path: str) -> list[Table]:
@@ -270,10 +263,10 @@ def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
     There `X` holds the time in seconds as `Data`, and each element of `Y` a signal with its `Name`.
     Where there are several times, or signals of one name, they are counted.
     """
-    result: list[tuple[str, Any, str | None]] = []
+    signals: list[tuple[str, Any, str | None]] = []
     for axis, usual in (("X", "s"), ("Y", "")):
-        item = _elements(value.get(axis))
-        several = item if isinstance(item, list) else [item]
+        elements = _elements(value.get(axis))
+        several = elements if isinstance(elements, list) else [elements]
         data = [s.get("Data") if isinstance(s, Mapping) else None for s in several]
         if not all(isinstance(numbers, np.ndarray) for numbers in data):
             return []
@@ -287,8 +280,8 @@ def _recorded(value: Mapping[str, Any]) -> list[tuple[str, Any, str | None]]:
         if "" in names or len(set(names)) < len(names):
             names = [f"{axis}.{k}" for k in range(1, len(names) + 1)]
         for name, text, unit, numbers in zip(names, texts, units, data, strict=True):
-            result.append((name, numbers, unit or stated_unit(text) or usual))
-    return result
+            signals.append((name, numbers, unit or stated_unit(text) or usual))
+    return signals
 
 
 def _modelica(path: str) -> Iterator[Series]:
@@ -298,21 +291,20 @@ def _modelica(path: str) -> Iterator[Series]:
     """
     from scipy.io import loadmat  # noqa: PLC0415
 
-    result = loadmat(path, chars_as_strings=False)
-    upright = "".join(result["Aclass"][3]).strip("\0 ") != "binTrans"
-    name, info, units = (
-        result[k] if upright else result[k].T for k in ("name", "dataInfo", "description")
-    )
-    for text, (block, at, *_), about in zip(name, np.atleast_2d(info), units, strict=True):
-        data = result.get(f"data_{block or 2}")
+    content = loadmat(path, chars_as_strings=False)
+    upright = "".join(content["Aclass"][3]).strip("\0 ") != "binTrans"
+    parts = (content[key] for key in ("name", "dataInfo", "description"))
+    names, info, units = (part if upright else part.T for part in parts)
+    for text, (block, at, *_), about in zip(names, np.atleast_2d(info), units, strict=True):
+        data = content.get(f"data_{block or 2}")
         if data is None or at == 0:
             continue
         row = (data.T if upright else data)[abs(int(at)) - 1]
         unit = re.search(r"\[([^\]|]*)", "".join(about))
-        item = "".join(text).strip("\0 ")
-        is_time = item.lower() == "time"
-        stated = unit[1] if unit else "s" if is_time else None
-        yield from series_in("time" if is_time else item, np.sign(at) * row, stated)
+        name = "".join(text).strip("\0 ")
+        name = "time" if name.lower() == "time" else name
+        stated = unit[1] if unit else "s" if name == "time" else None
+        yield from series_in(name, np.sign(at) * row, stated)
 
 
 _MARKS = str.maketrans(dict.fromkeys('\t\r\n;"', " "))
@@ -323,17 +315,14 @@ def excel_tables(path: str) -> list[Table]:
     from python_calamine import CalamineWorkbook, SheetVisibleEnum  # noqa: PLC0415
 
     book = CalamineWorkbook.from_path(path)
-    items = sorted(
-        book.sheets_metadata, key=lambda sheet: sheet.visible != SheetVisibleEnum.Visible
-    )
-    result = []
-    for sheet in items:
+    tables = []
+    for sheet in sorted(book.sheets_metadata, key=lambda s: s.visible != SheetVisibleEnum.Visible):
         rows = book.get_sheet_by_name(sheet.name).to_python(skip_empty_area=False)
         cells = [list(map(_cell_text, row)) for row in rows]
         kept = [k for k, column in enumerate(zip_longest(*cells)) if any(column)]
         lines = ["\t".join(row[k] for k in kept) if any(row) else "" for row in cells]
-        result += text_tables(path, lines, "row", sheet.name)
-    return result
+        tables += text_tables(path, lines, "row", sheet.name)
+    return tables
 
 
 def _cell_text(cell: object) -> str:
@@ -353,13 +342,13 @@ def tdms_tables(path: str) -> list[Table]:
     import nptdms  # noqa: PLC0415
     from nptdms.log import log_manager  # noqa: PLC0415
 
-    log_manager.set_level(50)  # it tells of damage on the terminal
+    log_manager.set_level(50)  # it reports damage on the terminal
     file = nptdms.TdmsFile.read_metadata(path)
     channels = [c for group in file.groups() for c in group.channels()]
     if sum(len(c) * c.dtype.itemsize for c in channels) > 2 * Path(path).stat().st_size:
         raise ValueError("it states more numbers than it has bytes for")
     several = len(file.groups()) > 1
-    result, stated = list[Series](), list[str]()
+    series, stated = list[Series](), list[str]()
     for channel in channels:
         if channel.dtype.kind not in "biufM":
             continue
@@ -369,9 +358,9 @@ def tdms_tables(path: str) -> list[Table]:
             with nptdms.TdmsFile.open(path) as whole:
                 return np.asarray(whole[group][text][:])
 
-        result.append(Series(name, len(channel), read, _unit_in(channel.properties)))
+        series.append(Series(name, len(channel), read, _unit_in(channel.properties)))
         stated += statements({k: v for k, v in channel.properties.items() if k == "wf_increment"})
-    return array_tables(path, result, stated)
+    return array_tables(path, series, stated)
 
 
 def parquet_tables(path: str) -> list[Table]:
@@ -389,11 +378,11 @@ def parquet_tables(path: str) -> list[Table]:
     def read(name: str) -> Cells:
         return _arrow_cells((whole or file.read([name], use_threads=False)).column(name), rows)
 
-    items = []
+    series = []
     for field in schema:
         about = {k.decode(): v.decode() for k, v in (field.metadata or {}).items()}
-        items.append(Series(field.name, rows, partial(read, field.name), _unit_in(about)))
-    return array_tables(path, items, place="row")
+        series.append(Series(field.name, rows, partial(read, field.name), _unit_in(about)))
+    return array_tables(path, series, place="row")
 
 
 def _arrow_cells(column: Any, rows: int) -> Cells:
@@ -471,9 +460,9 @@ _MAGIC = {
 
 
 def ending_of(path: str) -> str:
-    """Return the ending that says how a file is read, "" for text.
+    """Return the ending that decides how a file is read, "" for text.
 
-    Where the name has another, the first bytes of the file tell.
+    If the name has another, the first bytes of the file decide.
     """
     ending = Path(path).suffix.lower()
     if ending in READERS or ending in (".csv", ".gz"):

@@ -62,7 +62,7 @@ def joined(
 ) -> Outcome:
     """Return the samples of files that hold the channels of one record, with a hash of them all.
 
-    Each file is given by its path, its tables and its SHA-256. The clock is that of the first;
+    Each file has a path, tables and a SHA-256. The clock is that of the first;
     where another differs, its channels are interpolated at those instants that both have, and a
     note says so. A channel's name that several files have gets the file's in front. `alone` refuses
     files of several channels.
@@ -85,15 +85,15 @@ def joined(
             f" {clocks[0][0]:.9g} and {clocks[1][0]:.9g} s); let both begin with the record."
         )
     names = [name for _, name, *_ in channels]
-    items = [Series("time", int(shared.sum()), lambda: first[shared], "s")]
+    series = [Series("time", int(shared.sum()), lambda: first[shared], "s")]
     for path, name, unit, time, values in channels:
         label = f"{Path(path).stem}.{name}" if names.count(name) > 1 else name
         same = np.array_equal(time, first)
         resampled += [] if same else [Path(path).name]
         kept = (values if same else np.interp(first, time, values))[shared]
-        items.append(Series(label, kept.size, partial(np.asarray, kept), unit))
+        series.append(Series(label, kept.size, partial(np.asarray, kept), unit))
     together = "+".join(path for path, *_ in files)
-    outcome = samples_of(together, array_tables(together, items)[:1], request)
+    outcome = samples_of(together, array_tables(together, series)[:1], request)
     outcome.notes += (f"the channels of {len(files)} files are one record.",)
     if resampled:
         outcome.notes += (
@@ -105,7 +105,7 @@ def joined(
 
 
 def _clocks(times: Sequence[tuple[str, Cells, str]]) -> list[FloatArray]:
-    """Return the times of files, each given by path, cells and unit, on one clock [s].
+    """Return the times of files (path, cells, unit) on one clock [s].
 
     Dates and clock times are counted from the first of all files together.
     """
@@ -124,18 +124,16 @@ def _channels(
     path: str, tables: Sequence[Table]
 ) -> tuple[Cells, str, list[tuple[str, str | None, FloatArray]]]:
     """Return the times of a file with their unit, and its channels: name, unit, values."""
-    table = tables[0] if tables else None
-    at = next((k for k in range(len(table.header)) if rises(table, k)), None) if table else None
-    if table is None or at is None:
+    rising = [k for k in range(len(tables[0].header)) if rises(tables[0], k)] if tables else []
+    if not rising:
         raise InputError(f"{path}: holds no time, which files to be joined need.")
-    problems = Problems()
+    table, at, problems = tables[0], rising[0], Problems()
     columns = table.load(range(len(table.header)), None, problems)
     problems.raise_if_any()
     units = [stated_unit(text) for text in table.header]
     rows = zip(table.labels, units, columns.cells, strict=True)
-    channels = [
-        (label, unit, as_numbers(item)) for k, (label, unit, item) in enumerate(rows) if k != at
-    ]
+    others = (row for k, row in enumerate(rows) if k != at)
+    channels = [(label, unit, as_numbers(cells)) for label, unit, cells in others]
     channels = [channel for channel in channels if np.isfinite(channel[-1]).any()]
     return columns.cells[at], units[at] or "s", channels
 
@@ -200,9 +198,9 @@ class Frame(Protocol):
 
 
 TableLike = Frame | Mapping[str, npt.ArrayLike]
-#: What stands for one record wherever records are asked for.
+#: What a user may pass as one record.
 OneRecord = Signals | AnyPath | TableLike
-#: What stands for the records of one device.
+#: What a user may pass as the records of one device.
 Records = OneRecord | Iterable[OneRecord]
 
 
@@ -219,18 +217,18 @@ def read_record(
     `need_displacement` demands a displacement column with values, as a comparison does;
     `need_excitation` a voltage that changes, as a fit does. `columns` names the arrays of the file
     that are the columns, such as "time=t:ms,voltage=log.u,displacement=m.2:um" (`parse_columns`);
-    `displacement=CH2:10um` says that 1 in the file is 10 um, `b.csv@time=t:ms` is said of one file.
+    with `displacement=CH2:10um` 1 in the file is 10 um, `b.csv@time=t:ms` holds for one file.
     `columns="table=2"` takes one of several sheets, groups, blocks or segments. `sample_time` [s]
-    gives the time, whatever the file says of it. "a.csv+b.csv" are the channels of one record that
-    an instrument has saved one by one. `notes` of the record tell what was taken for what.
+    replaces the time of the file. "a.csv+b.csv" are the channels of one record that
+    an instrument has saved one by one. `notes` of the record are sentences on the reader's choices.
 
     Raises:
-        InputError: every mistake found in the file, one sentence each: file, line, column, what was
-            found, what was expected, what to do. At most 20 are listed, the others counted. An
+        InputError: every mistake in the file, one sentence each: file, line, column, the content,
+            what was expected, what to do. At most 20 are listed, the others counted. An
             option that a sentence offers reads this file.
     """
     request = _of_stack(need_displacement, need_excitation, sample_time)
-    request = _said_of(request, columns, Path(path).name)
+    request = _with_columns(request, columns, Path(path).name)
     return _record(str(path), _read(str(path), request), table=request.table)
 
 
@@ -262,13 +260,13 @@ def read_signals(
     columns: str | ColumnMap | None = None,
     sample_time: float | None = None,
 ) -> tuple[Signals, ...]:
-    """Return the records on a model of one's own in files, each in the units of its file.
+    """Return the records on any model in files, each in the units of its file.
 
-    `inputs` and `outputs` are the model's: a column is found by the name, whatever its case, spaces
-    and unit, and so is `time`. Each input must be there. `columns` and `sample_time` are those of
+    `inputs` and `outputs` are the model's: a column is matched by its name without case, spaces and
+    unit, and so is `time`. Each input must be there. `columns` and `sample_time` are those of
     `read_record`, as in `columns="u=CH1:mV,w=speed_2:rpm"`.
 
-        given = psa.read_signals("run.csv", inputs=model.input_names, outputs=model.output_names)
+        records = psa.read_signals("run.csv", inputs=model.input_names, outputs=model.output_names)
 
     Raises:
         InputError: as `read_records`.
@@ -304,19 +302,19 @@ def _several(
     problems: list[str] = []
     failed = 0
     for path in places:
-        item = _said_of(request, wanted, Path(path).name)
+        of_file = _with_columns(request, wanted, Path(path).name)
         try:
-            each = [item.table]
-            if item.table == ALL:
-                each = [*_read(path, replace(item, table="")).tables] or [""]
-            records += [make(path, _read(path, replace(item, table=t)), table=t) for t in each]
+            each = [of_file.table]
+            if of_file.table == ALL:
+                each = [*_read(path, replace(of_file, table="")).tables] or [""]
+            records += [make(path, _read(path, replace(of_file, table=t)), table=t) for t in each]
         except InputError as error:
             failed += 1
             problems.extend(error.problems)
     if failed == len(places) > 1:  # they may hold a channel each
-        item, outcome = _said_of(request, wanted, ""), None
+        of_all, outcome = _with_columns(request, wanted, ""), None
         with suppress(InputError):
-            outcome = joined([(p, *apart.text_of(p)) for p in places], item, alone=True)
+            outcome = joined([(p, *apart.text_of(p)) for p in places], of_all, alone=True)
         if outcome is not None:
             return [make("+".join(places), outcome)]
     if not places:
@@ -337,25 +335,25 @@ def record_from(
     """Return the record in a data frame or a mapping of arrays, checked as a file is.
 
     Names carry units as a CSV header does: `{"time [s]": t, "voltage [V]": v, "displacement [um]":
-    x}`; or `columns` says which is which, and `sample_time` [s] gives the time, as for
+    x}`; or `columns` maps the names, and `sample_time` [s] replaces the time, as for
     `read_record`.
 
     Raises:
-        InputError: every mistake found, one sentence each.
+        InputError: every mistake, one sentence each.
     """
     request = _of_stack(need_displacement, False, sample_time)
-    return _record(name, _in_memory(table, name, _said_of(request, columns, name)), source="")
+    return _record(name, _in_memory(table, name, _with_columns(request, columns, name)), source="")
 
 
 def _in_memory(table: TableLike, name: str, request: Request) -> Outcome:
     """Return the samples of a table in memory, with a hash of them."""
-    items = list(table if isinstance(table, Mapping) else table.columns)
+    keys = list(table if isinstance(table, Mapping) else table.columns)
 
     def load(numbers: Sequence[int], most: int | None, problems: Problems) -> Columns:
-        cells = [_cells(name, items[k], table[items[k]], problems)[:most] for k in numbers]
+        cells = [_cells(name, keys[k], table[keys[k]], problems)[:most] for k in numbers]
         return Columns(cells, np.arange(1, 1 + max(map(len, cells), default=0)))
 
-    header = [str(text) for text in items]
+    header = [str(key) for key in keys]
     labels = [name_and_unit(text)[0] for text in header]
     held = Table(name, "", header, labels, f"{name}: column names", "row", load)
     outcome = samples_of(name, [held], request)
@@ -385,12 +383,12 @@ def _cells(name: str, item: object, column: Any, problems: Problems) -> npt.NDAr
     return values.ravel()
 
 
-def _said_of(request: Request, columns: str | ColumnMap | None, file: str) -> Request:
-    """Return what is wanted of a file, with what `columns` say of this one."""
-    output = parse_columns(columns, request.names) if isinstance(columns, str) else columns or {}
-    item = dict(columns_of(output, file))
-    chosen = item.pop(TABLE, Source("", None)).array
-    return replace(request, columns=item, table=chosen)
+def _with_columns(request: Request, columns: str | ColumnMap | None, file: str) -> Request:
+    """Return the request with the sources and the table that `columns` name for a file."""
+    every = parse_columns(columns, request.names) if isinstance(columns, str) else columns or {}
+    of_file = dict(columns_of(every, file))
+    table = of_file.pop(TABLE, Source("", None)).array
+    return replace(request, columns=of_file, table=table)
 
 
 def _read(path: str, request: Request) -> Outcome:
@@ -401,20 +399,21 @@ def _read(path: str, request: Request) -> Outcome:
 
 
 def records_given(records: Records) -> tuple[Record, ...]:
-    """Return what was given as records: one or several records, paths of files, tables.
+    """Return one or several records from records, paths of files or tables.
 
     Raises:
         InputError: the mistakes of all of them together.
     """
 
-    def one(records: Any, name: str) -> Record:
-        if isinstance(records, Signals):
-            return (
-                records if isinstance(records, Record) else record_from(_table(records), name=name)
-            )
-        return read_record(records) if _is_path(records) else record_from(records, name=name)
+    def convert(source: Any, name: str) -> Record:
+        if isinstance(source, Record):
+            return source
+        if isinstance(source, Signals):
+            columns, units = {"time": source.time, **source.columns}, {"time": "s", **source.units}
+            return record_from(with_units(columns, units), name=name)
+        return read_record(source) if _is_path(source) else record_from(source, name=name)
 
-    return tuple(_each(records, one, 1, "'voltage [V]': v"))
+    return tuple(_each(records, convert, 1, "'voltage [V]': v"))
 
 
 def signals_given(
@@ -435,26 +434,26 @@ def signals_given(
     """
     request = _request_of(inputs, outputs)
 
-    def one(arguments: Any, name: str) -> Signals:
-        if isinstance(arguments, Signals):
-            return Signals(**{f.name: getattr(arguments, f.name) for f in fields(Signals)})
-        if _is_path(arguments):
-            return _signals(str(arguments), _read(str(arguments), request))
-        return _signals(name, _in_memory(arguments, name, request), source="")
+    def convert(source: Any, name: str) -> Signals:
+        if isinstance(source, Signals):
+            return Signals(**{f.name: getattr(source, f.name) for f in fields(Signals)})
+        if _is_path(source):
+            return _signals(str(source), _read(str(source), request))
+        return _signals(name, _in_memory(source, name, request), source="")
 
-    result = _each(arguments, one, first, f"'{(*inputs, *outputs)[0]}': u")
-    if not result:
+    records = _each(arguments, convert, first, f"'{(*inputs, *outputs)[0]}': u")
+    if not records:
         raise InputError("There are no records; give one or more.")
-    return result if hold is None else [replace(s, hold=hold) for s in result]
+    return records if hold is None else [replace(s, hold=hold) for s in records]
 
 
-def _each(items: Any, one: Callable[[Any, str], _Made], first: int, example: str) -> list[_Made]:
-    """Return what `one` makes of every record that was given, with a name where it has none."""
-    is_one = isinstance(items, Signals) or _is_path(items) or _is_table(items)
-    if not is_one and not isinstance(items, Iterable):
-        items = [items]
-    several = [items] if is_one else list(items)
-    result: list[_Made] = []
+def _each(sources: Any, make: Callable[[Any, str], _Made], first: int, example: str) -> list[_Made]:
+    """Return every record as `make` makes it, with a name if it has none."""
+    is_one = isinstance(sources, Signals) or _is_path(sources) or _is_table(sources)
+    if not is_one and not isinstance(sources, Iterable):
+        sources = [sources]
+    several = [sources] if is_one else list(sources)
+    records: list[_Made] = []
     problems: list[str] = []
     for k, each in enumerate(several, first):
         if not (isinstance(each, Signals) or _is_path(each) or _is_table(each)):
@@ -464,21 +463,16 @@ def _each(items: Any, one: Callable[[Any, str], _Made], first: int, example: str
             )
             continue
         try:
-            result.append(one(each, f"record {k}" if several[1:] or first > 1 else "record"))
+            records.append(make(each, f"record {k}" if several[1:] or first > 1 else "record"))
         except InputError as error:
             problems.extend(error.problems)
     if problems:
         raise InputError(problems)
-    return result
+    return records
 
 
 def _is_path(inputs: object) -> TypeGuard[AnyPath]:
     return isinstance(inputs, str | os.PathLike)
-
-
-def _table(signals: Signals) -> dict[str, Any]:
-    """Return the columns of signals with their units in the names."""
-    return with_units({"time": signals.time, **signals.columns}, {"time": "s", **signals.units})
 
 
 def _is_table(inputs: object) -> TypeGuard[TableLike]:
@@ -509,7 +503,7 @@ def _signals(path: str, outcome: Outcome, *, source: str | None = None, table: s
 def _samples(
     path: str, outcome: Outcome, source: str | None, table: str
 ) -> tuple[dict[str, FloatArray], dict[str, Any]]:
-    """Return the columns that were read, and what says whence they are."""
+    """Return the columns that were read, and name, hash, source and notes of the record."""
     if outcome.problems:
         raise InputError(outcome.problems)
     if not outcome.units:

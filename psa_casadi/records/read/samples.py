@@ -8,12 +8,12 @@ import numpy as np
 from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
-from psa_casadi.records.read.file_bytes import check_size
 from psa_casadi.records.read.table import (
     Cells,
     Columns,
     Table,
     as_times,
+    check_size,
     decimal_sign,
     evened,
     is_number,
@@ -46,11 +46,11 @@ MOST_NAMED = 8
 class Request:
     """What is wanted of a file.
 
-    `columns` says which column is which, `sample_time` [s] gives the time of samples without one,
-    `table` takes one of several tables; `needed` are the columns that must be there beside the
-    time, and `excitation` demands a voltage that changes. With `names`, those of a model's inputs
-    and outputs, it is a record on that model; else one of a stack, or without a voltage among the
-    needed a path to follow, which is checked elsewhere.
+    `columns` maps columns to their sources, `sample_time` [s] is the time between samples without
+    one, `table` takes one of several tables; `needed` are the columns that must be there besides
+    the time, and `excitation` demands a voltage that changes. With `names`, those of a model's
+    inputs and outputs, it is a record on that model; else one of a stack, or without a voltage
+    among the needed a path to follow, which is checked elsewhere.
     """
 
     columns: ColumnMap = field(default_factory=dict)
@@ -77,6 +77,22 @@ class Request:
         return Choice(with_usual_units(table), self.required, self.columns, problems)
 
 
+@dataclass(frozen=True)
+class Head:
+    """The columns of a table by the names that `--columns` takes, and the first rows.
+
+    A name is "" if `--columns` cannot name it. `units` are those that the file states, "" if it
+    states none; `rows` hold the cells as text. `guess` maps the columns of a record to their
+    places, as the reader takes them or would suggest them. `tables` are those of the file.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    guess: Mapping[str, Field]
+    tables: tuple[str, ...] = ()
+
+
 @dataclass
 class Outcome:
     """The columns of one record in the units of the file, checked, or what is wrong.
@@ -85,7 +101,8 @@ class Outcome:
     reading; there are none where nothing is read. `notes` are sentences on what was taken for what,
     `unread` the labels of other columns where one that a model has is missing.
     `tables` are the choices where there are several records, `offer` the columns and the sample
-    time [s] with which the file is read, `sha256` is that of the file.
+    time [s] with which the file is read, `sha256` is that of the file; `head` is the head of a
+    file of which no samples are read.
     """
 
     problems: tuple[str, ...] = ()
@@ -96,6 +113,7 @@ class Outcome:
     tables: tuple[str, ...] = ()
     offer: tuple[ColumnMap, float | None] | None = None
     sha256: str = ""
+    head: Head | None = None
 
     @property
     def is_read(self) -> bool:
@@ -125,10 +143,9 @@ def samples_of(path: str, tables: Sequence[Table], request: Request) -> Outcome:
     is_part = tables[0] in parts.values()
     if len(tables) == 1 or whole.tables or (not is_part and (whole.is_read or request.columns)):
         return whole  # of arrays all together are one record
-    result = {key: _of_one(table, request, "") for key, table in parts.items()}
-    return (
-        _of_several(path, result) if is_part or any(o.is_read for o in result.values()) else whole
-    )
+    each = {key: _of_one(table, request, "") for key, table in parts.items()}
+    several = is_part or any(outcome.is_read for outcome in each.values())
+    return _of_several(path, each) if several else whole
 
 
 def _of_several(path: str, outcomes: Mapping[str, Outcome]) -> Outcome:
@@ -156,19 +173,19 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
     tried = _Try(table, request, segment)
     if not tried.open:
         return tried.outcome
-    items = [f"{q.what}; {q.cure}" if q.cure else q.what for q in tried.open]
+    sentences = [f"{q.what}; {q.cure}" if q.cure else q.what for q in tried.open]
     offer, key = _offer(table, request, tried.choice, segment)
     if offer:
         last = tried.open[-1]
         how = last.ask if offer[0] else "give the time between samples"
         join = ", or" if last.cure else ";"
-        items[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
+        sentences[-1] += f"{join} {how}: {ready_line(*offer, key or request.table)}"
     elif len(table.header) == 2 and not table.sizes:
-        items[-1] += "; files of one channel each are joined as FILE+FILE"
-    whole = Problems()
-    for sentence in (*(f"{s}." for s in items), *tried.problems.sentences()):
-        whole.add(sentence)
-    return replace(tried.outcome, problems=whole.sentences(), offer=offer)
+        sentences[-1] += "; files of one channel each are joined as FILE+FILE"
+    problems = Problems()
+    for sentence in (*(f"{s}." for s in sentences), *tried.problems.sentences()):
+        problems.add(sentence)
+    return replace(tried.outcome, problems=problems.sentences(), offer=offer)
 
 
 def _offer(
@@ -185,13 +202,13 @@ def _offer(
     for sources, step in trials:
         trial = replace(request, columns=sources, sample_time=step)
         offer = (sources if sources != request.columns else {}, step if inputs is None else None)
-        result = _Try(table, trial, segment)
-        if result.open:
+        tried = _Try(table, trial, segment)
+        if tried.open:
             continue
-        if result.outcome.is_read:
+        if tried.outcome.is_read:
             return offer, ""
-        if result.outcome.tables and _Try(table, trial, "1").outcome.is_read:
-            return offer, result.outcome.tables[0]
+        if tried.outcome.tables and _Try(table, trial, "1").outcome.is_read:
+            return offer, tried.outcome.tables[0]
     return None, ""
 
 
@@ -203,11 +220,9 @@ class _Try:
         self.outcome, self.problems = Outcome(), Problems()
         self.choice = request.chosen(table, self.problems)
         if table.step and "time" not in self.choice.fields and request.sample_time is None:
-            step = table.step
-            self.notes.append(
-                f"the time is that of the sample time that the file states, {step:g} s."
-            )
-            request, self.problems = replace(request, sample_time=step), Problems()
+            note = f"the time is that of the sample time that the file states, {table.step:g} s."
+            self.notes.append(note)
+            request, self.problems = replace(request, sample_time=table.step), Problems()
             self.choice = request.chosen(table, self.problems)
         self.request, self.open = request, self.choice.open
         if self.choice.fields:
@@ -219,41 +234,39 @@ class _Try:
         table, request = self.table, self.request
         step = request.sample_time
         if step is not None and fields.pop("time", None) is not None:
-            self.notes.append(
-                "the times of the file are left out for the sample time that was given."
-            )
+            note = "the times of the file are left out for the sample time that was given."
+            self.notes.append(note)
         columns = table.load([f.index for f in fields.values()], None, self.problems)
         if self._lengths_differ(fields, columns):
             return
         texts = [cells for cells in columns.cells if not isinstance(cells, np.ndarray)]
         point = decimal_sign(c for row in zip(*texts, strict=False) for c in row)
-        result = {
+        located = {
             name: self._numbers(name, item.unit, cells, columns.lines, point)
             for (name, item), cells in zip(fields.items(), columns.cells, strict=True)
         }
         units = {name: item.unit for name, item in fields.items()}
         if step is not None:
             units = {"time": "s", **units}
-            result = {"time": self._even_time(step, columns.lines), **result}
-        elif "time" in result:
-            part = self._timed(result)
+            located = {"time": self._even_time(step, columns.lines), **located}
+        elif "time" in located:
+            part = self._timed(located)
             if part is None:
                 return
-            result = {n: c.part(part) for n, c in result.items()}
-        check_size(table.path, 8 * len(columns.lines) * len(result), "its columns hold")
-        self._check(result)
+            located = {n: c.part(part) for n, c in located.items()}
+        check_size(table.path, 8 * len(columns.lines) * len(located), "its columns hold")
+        self._check(located)
         scales = {n: source.scale for n, source in request.columns.items() if source.scale}
         self.outcome.values = np.column_stack(
-            [c.values * scales[n] if n in scales else c.values for n, c in result.items()]
+            [c.values * scales[n] if n in scales else c.values for n, c in located.items()]
         )
         self.outcome.units, self.outcome.notes = units, tuple(self.notes)
         self.outcome.unread = self.choice.unread
 
     def _even_time(self, step: float, lines: IndexArray) -> Located:
         if not 0.0 < step < 1e9:
-            raise InputError(
-                f"{self.table.path}: the sample time {step} s is no time; give seconds."
-            )
+            problem = f"the sample time {step} s is no time; give seconds."
+            raise InputError(f"{self.table.path}: {problem}")
         if step != self.table.step:
             self.notes.append(
                 f"{step:g} s from sample to sample is what was given; if it is invented, as for a"
@@ -265,13 +278,13 @@ class _Try:
         self, name: str, values: FloatArray, lines: IndexArray,
         wrong: BoolArray | None = None,
     ) -> Located:  # fmt: skip
-        output = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
-        return Located(self.table.path, name, values, lines, output, self.table.place)
+        reported = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
+        return Located(self.table.path, name, values, lines, reported, self.table.place)
 
     def _numbers(
         self, name: str, unit: str, cells: Cells, lines: IndexArray, point: str
     ) -> Located:
-        """Return a column as numbers; what is none is told with its place."""
+        """Return a column as numbers; report what is none with its place."""
         table = self.table
         values = as_times(cells, unit) if name == "time" else None
         if values is None and isinstance(cells, np.ndarray):
@@ -302,8 +315,7 @@ class _Try:
     def _timed(self, locateds: Mapping[str, Located]) -> slice | None:
         """Return the part of the samples that is the record; mend a time with too few digits.
 
-        None where the time begins anew: each part is a record, or packets have no time of their
-        own.
+        None if the time restarts: each part is a record, or the time is that of packets.
         """
         table, time, lines = self.table, locateds["time"].values, locateds["time"].lines
         starts = starts_of(np.nan_to_num(time, nan=-np.inf) if np.isnan(time).any() else time)
@@ -319,7 +331,7 @@ class _Try:
                     for key, a, b in list(zip(keys, starts, ends, strict=True))[:MOST_NAMED]
                 )
                 self.outcome.tables = tuple(keys)
-                if not self.open:  # which is asked first, as of no part
+                if not self.open:  # an open question of the whole table comes first
                     self.problems.add(
                         f"{table.path}: the time begins anew {len(keys) - 1} times, so it holds"
                         f" {len(keys)} records: {listed}; take one of them, such as"

@@ -1,8 +1,13 @@
-"""What every file is read to: tables of named columns, whose cells are numbers, text or times."""
+"""What every file is read to: its bytes, and tables whose cells are numbers, texts or times."""
 
 import calendar
+import gzip
+import hashlib
+import io
 import math
+import os
 import re
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -10,6 +15,7 @@ from datetime import date
 from decimal import Decimal
 from fractions import Fraction
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +25,79 @@ from psa_casadi.errors import InputError, Problems
 from psa_casadi.records.read.columns import MARKS, unit_named
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.units import BoolArray, FloatArray, IndexArray, parse_unit, to_si
+
+#: The most bytes that a record may have, in its file or unpacked in memory.
+MOST_BYTES = 2**30
+_BLOCK = 2**20
+#: Bytes in memory of the fewest columns that a record has: a time and one number.
+_LEAST_ON_A_LINE = 16
+
+
+def check_there(path: str | os.PathLike[str]) -> None:
+    """Refuse what is no file that can be read and holds something.
+
+    Raises:
+        InputError: the file is missing, a directory, unreadable or empty.
+    """
+    try:
+        with Path(path).open("rb") as stream:
+            is_empty = not stream.read(_BLOCK).strip()
+    except FileNotFoundError:
+        raise InputError(
+            f"{path}: there is no such file; check the name and the directory it is in."
+        ) from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a directory; name the CSV files in it.") from None
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check that you may read it."
+        ) from error
+    if is_empty:
+        raise InputError(f"{path}: the file is empty; export the record again.")
+
+
+def read_text(path: str | os.PathLike[str]) -> tuple[bytes, str]:
+    """Return the content of a file of text, unpacked where it is gzipped, and the file's SHA-256.
+
+    Raises:
+        InputError: it is larger than `MOST_BYTES`, or damaged.
+    """
+    with Path(path).open("rb") as stream:
+        data = content = _most(stream.read)
+    check_size(path, len(data), "holds")
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            with gzip.GzipFile(fileobj=io.BytesIO(data)) as unpacked:
+                content = _most(unpacked.read)
+        except (OSError, EOFError, zlib.error) as error:
+            raise InputError(f"{path}: is a damaged gzip file ({error}); pack it again.") from error
+        check_size(path, len(content), "holds")
+    lines = max(content.count(b"\n"), content.count(b"\r"))
+    check_size(path, _LEAST_ON_A_LINE * lines, "its lines need")
+    return content, hashlib.sha256(data).hexdigest()
+
+
+def _most(read: Callable[[int], bytes]) -> bytes:
+    """Return the content that is read, or more than `MOST_BYTES` of it; takes no more memory."""
+    blocks, size = [], 0
+    while size <= MOST_BYTES and (block := read(_BLOCK)):
+        blocks.append(block)
+        size += len(block)
+    return b"".join(blocks)
+
+
+def check_size(path: str | os.PathLike[str], size: int, what: str) -> None:
+    """Refuse more than `MOST_BYTES`; `what` starts the sentence, such as "its columns hold".
+
+    Raises:
+        InputError: `size` is larger.
+    """
+    if size > MOST_BYTES:
+        raise InputError(
+            f"{path}: {what} more than {MOST_BYTES / 2**30:.3g} GiB, the most that is read as one "
+            f"record; leave out arrays that are not needed, or split the record."
+        )
+
 
 #: The cells of one column: numbers or instants (n,), or texts.
 Cells = NDArray[Any] | Sequence[str]
@@ -34,7 +113,7 @@ class Columns:
     lines: IndexArray
 
 
-#: What gives the columns of a table by their indices, at most so many rows of them. It adds rows
+#: What gives the columns of a table by their indices, at most the first rows of them. It adds rows
 #: that are of another length to the problems.
 Loader = Callable[[Sequence[int], int | None, Problems], Columns]
 
@@ -44,10 +123,10 @@ class Table:
     """One table of a file: the names of its columns with their units, and its cells on demand.
 
     `header` holds texts such as "voltage [V]"; `labels` are the names that `--columns` takes for
-    them. `where` (file and line) begins the sentences about the header, `place` is what holds one
+    them. `where` (file and line) starts the sentences about the header, `place` is what holds one
     sample: a "line", a "row", a "sample". `sizes` are the lengths of the columns where they differ.
-    `step` [s] is the time between samples that the file states beside its columns. `headless` has
-    the first numbers of a table without a header, whose columns are counted from 1.
+    `step` [s] is the time between samples that the file states outside of its columns. `headless`
+    has the first numbers of a table without a header, whose columns are counted from 1.
     """
 
     path: str
@@ -110,19 +189,17 @@ SWAPPED = str.maketrans(".,", ",.")
 
 def is_number(text: str) -> bool:
     """Whether a text is a number as it may stand in a table, or an empty cell's word."""
-    text = text.strip().strip('"').strip()
-    return bool(
-        _NUMBER.fullmatch(_FORTRAN.sub("e", text)) or text.lower() in ("nan", "inf", "-inf")
-    )
+    text = text.strip().strip('"').strip().lower()
+    return text in ("nan", "inf", "-inf") or bool(_NUMBER.fullmatch(_FORTRAN.sub("e", text)))
 
 
 def is_missing(text: str) -> bool:
-    """Whether a text stands for a reading that is not there."""
+    """Whether a text marks a missing reading."""
     return not text.strip() or _MISSING.fullmatch(text.strip()) is not None
 
 
 def unit_in(cells: Sequence[str]) -> str | None:
-    """Return the unit that stands in the first cell that is a number with a unit, else None."""
+    """Return the unit in the first cell that is a number with a unit, else None."""
     for cell in cells[:50]:
         if (match := _WITH_UNIT.fullmatch(cell.strip())) and not _FORTRAN.search(cell):
             return unit_named(match["unit"], common=False)
@@ -155,8 +232,8 @@ def without_overload(values: FloatArray) -> FloatArray:
 def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray, BoolArray]:
     """Return the numbers in texts, nan where there is none, and which texts are no numbers.
 
-    A word for a missing reading is no such text. The decimal sign is `point`; a cell's own unit is
-    turned to `unit`.
+    A word for a missing reading is no such text. The decimal sign is `point`; a cell's unit is
+    converted to `unit`.
     """
     plain = cells if point == "." else [c.translate(SWAPPED) for c in cells]
     with suppress(ValueError):
@@ -164,9 +241,9 @@ def numbers_in(cells: Sequence[str], point: str, unit: str) -> tuple[FloatArray,
         if "_" not in "".join(cells):
             return without_overload(values), np.zeros(values.size, dtype=np.bool_)
     known = {cell: _number(cell, point, unit) for cell in set(cells)}
-    items = [known[cell] for cell in cells]
-    numbers = np.array([math.nan if v is None else v for v in items])
-    return without_overload(numbers), np.array([v is None for v in items], dtype=np.bool_)
+    parsed = [known[cell] for cell in cells]
+    numbers = np.array([math.nan if v is None else v for v in parsed])
+    return without_overload(numbers), np.array([v is None for v in parsed], dtype=np.bool_)
 
 
 def as_numbers(cells: Cells, unit: str = "") -> FloatArray:
@@ -177,7 +254,7 @@ def as_numbers(cells: Cells, unit: str = "") -> FloatArray:
 
 
 def _number(cell: str, point: str, unit: str) -> float | None:
-    """Return the number of a cell, nan where it says that there is none, else None."""
+    """Return the number of a cell, nan if it marks a missing one, else None."""
     text = _FORTRAN.sub("e", cell.strip())
     if is_missing(text):
         return math.nan
@@ -188,17 +265,17 @@ def _number(cell: str, point: str, unit: str) -> float | None:
         return None if "_" in text else float(plain)
     except ValueError:
         match = _WITH_UNIT.fullmatch(text)
-    item = unit_named(match["unit"], common=False) if match else None
-    value = _number(match["number"], point, unit) if match and item else None
-    if value is None or item is None:
+    stated = unit_named(match["unit"], common=False) if match else None
+    number = _number(match["number"], point, unit) if match and stated else None
+    if number is None or stated is None:
         return None
     try:
-        one, other = parse_unit(item), parse_unit(unit)
+        one, other = parse_unit(stated), parse_unit(unit)
     except InputError:
         return None
     if one == other:
-        return value
-    return value * float(one.ratio / other.ratio) if one.dimension == other.dimension else None
+        return number
+    return number * float(one.ratio / other.ratio) if one.dimension == other.dimension else None
 
 
 _DAY = 86400.0
@@ -220,12 +297,17 @@ _EPOCHS = {"s": 0, "ms": 3, "us": 6, "ns": 9}
 
 def is_stamp(cell: str) -> bool:
     """Whether a text is a date, a clock time or both."""
-    result = _STAMP.fullmatch(cell.strip().strip('"'))
-    return result is not None and (result["h"] is not None or result["a"] is not None)
+    return _stamp(cell) is not None
+
+
+def _stamp(cell: str) -> re.Match[str] | None:
+    """Return the parts of a date, a clock time or both; None if a text is none."""
+    match = _STAMP.fullmatch(cell.strip().strip('"'))
+    return match if match and (match["h"] or match["a"]) else None
 
 
 def unit_of_times(times: FloatArray) -> str | None:
-    """Return the unit that the size of the first times tells, None where it tells none.
+    """Return the unit that the size of the first times implies, None if it implies none.
 
     They are counted from 1970; or they are days since the year 0, as MATLAB counts them: seconds of
     that size would be samples of 500 kHz after nine days.
@@ -245,10 +327,9 @@ def seconds_of(cells: Sequence[str]) -> FloatArray | None:
     Of 3/4/2024 the day is what makes the record the shorter one; a clock that goes back by more
     than half a day has passed midnight.
     """
-    items = [_STAMP.fullmatch(cell.strip().strip('"')) for cell in cells]
-    if not items or any(m is None or (m["h"] is None and m["a"] is None) for m in items):
+    stamps = [stamp for cell in cells if (stamp := _stamp(cell))]
+    if not stamps or len(stamps) < len(cells):
         return None
-    stamps = [m for m in items if m is not None]
     exact = [_clock(m) for m in stamps]
     clock = np.array([float(t - exact[0]) for t in exact])
     if stamps[0]["a"] is None:
@@ -337,6 +418,6 @@ def evened(time: FloatArray) -> tuple[FloatArray, float] | None:
 
 
 def starts_of(time: FloatArray) -> IndexArray:
-    """Return the indices at which the time begins anew, the first sample among them."""
+    """Return the indices at which the time restarts, the first sample among them."""
     with np.errstate(invalid="ignore"):
         return np.flatnonzero(np.r_[True, np.diff(time) < 0.0])

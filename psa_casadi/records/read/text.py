@@ -2,8 +2,8 @@
 
 LabVIEW measurement files (`.lvm`), the data recorders of PI controllers (GCS arrays) and
 oscilloscopes by Rigol and Tektronix keep the names of the columns and the sample time in a head, or
-beside the numbers. They become a plain table of the same number of lines, so that a mistake is told
-with the line of the file.
+next to the numbers. They become a plain table of the same number of lines, so that mistakes are
+reported with the line of the file.
 
 Sources: National Instruments, "Specification for the LabVIEW Measurement File (.lvm)"; Physik
 Instrumente, "GCS Array Data Format".
@@ -45,13 +45,13 @@ from psa_casadi.records.read.table import (
 from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
 from psa_casadi.units import FloatArray, to_si, units_of
 
-#: Lines in which the first header is looked for, and the most that are asked for further ones.
+#: Lines in which the first header is looked for, and the most in which further ones are.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000
 #: The most rows of remarks below the units.
 _MOST_REMARKS = 3
 SPACES, _BEFORE_UNIT = re.compile(r"[ \t]+"), re.compile(r"\s+(?=[\[(])")
 _WIDE = re.compile(r"\s*\t\s*|[ ]{2,}")
-#: How a line begins that may be a header: with a letter or a bracket, perhaps quoted or a comment.
+#: The start of a line that may be a header: a letter or a bracket, perhaps quoted or a comment.
 WORDY = re.compile(r"[#%\s\"']*[^\W\d_(\[]")
 
 
@@ -66,7 +66,7 @@ class Layout:
 
 
 def laid_out(lines: Sequence[str], mark: str) -> Layout | None:
-    """Return where the first header and its numbers are; "" for a `mark` that is not told."""
+    """Return the place of the first header and its numbers; `mark` is "" if it is not stated."""
     start = next((k for k, line in enumerate(lines) if holds(line)), None)
     if start is None:
         return None
@@ -112,14 +112,12 @@ def _with_header(lines: Sequence[str], place: int, mark: str) -> Layout:
 
 def further_layouts(lines: Sequence[str], mark: str, first: Layout) -> Iterator[Layout]:
     """Yield the layouts of the headers below the first one."""
-    requested, begin = 0, first.first
-    if not first.header:
-        return
-    for k in range(first.first + 1, len(lines)):
+    tried, begin = 0, first.first
+    for k in range(first.first + 1, len(lines)) if first.header else ():
         if k < begin or not WORDY.match(lines[k]):
             continue
-        requested += 1
-        if requested > _MOST_HEADERS:
+        tried += 1
+        if tried > _MOST_HEADERS:
             return
         if _named(lines, [k], mark, sure=True) is not None:
             layout = _with_header(lines, k, mark)
@@ -129,9 +127,9 @@ def further_layouts(lines: Sequence[str], mark: str, first: Layout) -> Iterator[
 
 
 def cells_of(line: str, delimiter: str, *, spaced: bool = False) -> list[str]:
-    """Return the cells of a line; the delimiter " " stands for any number of spaces.
+    """Return the cells of a line; the delimiter " " means any number of spaces.
 
-    `spaced` says that a space may stand before a quoted cell.
+    With `spaced` a space may precede a quoted cell.
     """
     if delimiter == " ":
         return SPACES.split(_BEFORE_UNIT.sub("", line.strip()))
@@ -170,9 +168,9 @@ def _above_numbers(lines: Sequence[str], start: int, mark: str) -> int:
     """Return the line of names, and of units below it, above the first numbers, else the first."""
     places = range(start, min(len(lines), _MOST_LINES))
     first = next((k for k in places if _numbers(lines[k], mark)), start)
-    output = mark or _numbers(lines[first], mark).strip(" ")
+    of_numbers = mark or _numbers(lines[first], mark).strip(" ")
     cells = [
-        cells_of(line, output if output and output in line else delimiter_of(line))
+        cells_of(line, of_numbers if of_numbers and of_numbers in line else delimiter_of(line))
         for line in lines[max(start, first - 2) : first + 1]
     ]
     if len(cells) == 3 and len(cells[0]) == len(cells[2]) and units_row(cells[1]) is not None:
@@ -201,10 +199,10 @@ def _named(
     return None
 
 
-#: The most lines below a table that are told as no samples: sums, means, an end mark.
+#: The most lines below a table that are recognised as no samples: sums, means, an end mark.
 _MOST_BELOW = 20
-#: A first line that tells Excel what separates the cells.
-_TOLD_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
+#: A first line that declares the separator of the cells to Excel.
+_EXCEL_MARK = re.compile(r"\s*\"?sep=([^\w\s]|\t)\"?[\s,;]*", re.I)
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[({](?P<unit>[^\[\](){}]+)[\])}]")
 _COMMENTS = ("#", "%", "!", "//", ";")
 
@@ -215,15 +213,15 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
     The header is the first line that names two columns of a record, in a comment too if numbers
     follow; where none does, it is the line above the first numbers, else the first line that is no
     comment, and where that one holds numbers there is no header. A row of units below is joined to
-    the names. A first line `sep=;` says what separates the cells.
+    the names. A first line `sep=;` declares the separator of the cells.
 
     Raises:
         InputError: the head of an instrument's file is damaged.
     """
     lines, header, step = instrument_lines(path, lines) if place == "line" else (lines, (), None)
-    output = _TOLD_MARK.fullmatch(lines[0]) if lines else None
-    mark = output[1] if output else ""
-    lines = ["", *lines[1:]] if output else lines
+    mark = ""
+    if lines and (separator := _EXCEL_MARK.fullmatch(lines[0])):
+        mark, lines = separator[1], ["", *lines[1:]]
     first = _in_rows(lines, mark) or laid_out(lines, mark)
     if header:
         first = Layout(header, delimiter_of(next(filter(holds, lines), "")), 0, 0)
@@ -231,13 +229,13 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
         return []
     if isinstance(first, Table):
         return [replace(first, path=path, where=f"{path}: {place} 1", name=name)]
-    items = [first, *further_layouts(lines, mark, first)]
-    ends = [*(layout.header_line for layout in items[1:]), len(lines)]
+    layouts = [first, *further_layouts(lines, mark, first)]
+    ends = [*(layout.header_line for layout in layouts[1:]), len(lines)]
     step = step or stated_step(lines[: first.first])
     tables: list[Table] = []
-    for layout, stop in zip(items, ends, strict=True):
+    for layout, stop in zip(layouts, ends, strict=True):
         end = stop
-        if len(items) > 1 and stop - layout.first < FEWEST_SAMPLES:
+        if len(layouts) > 1 and end - layout.first < FEWEST_SAMPLES:
             continue
         while layout.first < end < len(lines):  # above the preamble of the next one
             cells = cells_of(lines[end - 1], layout.delimiter)
@@ -252,7 +250,7 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
 
 
 def _side_by_side(table: Table) -> list[Table]:
-    """Return the tables that stand beside each other: the header has the same names again."""
+    """Return the tables that lie side by side: the header has the same names again."""
     header = list(table.header)
     first = next((text for text in header if text.strip()), None)
     starts = [k for k, text in enumerate(header) if text == first]
@@ -284,8 +282,8 @@ class _Part:
         )  # fmt: skip
         if not layout.header:
             numbered = tuple(str(k) for k in range(1, width + 1))
-            output = ",".join(self._cells(first))
-            return replace(bare, header=numbered, labels=numbered, headless=output)
+            headless = ",".join(self._cells(first))
+            return replace(bare, header=numbered, labels=numbered, headless=headless)
         header = [_with_unit(h, c) for h, c in zip(layout.header, bare.glance, strict=True)]
         return replace(bare, header=header, labels=[name_and_unit(text)[0] for text in header])
 
@@ -303,7 +301,7 @@ class _Part:
         split, whole = [], []
         for line, row in zip(lines, rows, strict=True):
             cells = self._cells(row)
-            if most is not None:  # a glance tells no mistakes
+            if most is not None:  # a glance reports no mistakes
                 cells = [*cells, *[""] * width][:width]
             spare = len(cells) - width
             if (spare > 0 and any(c.strip() for c in cells[width:])) or (
@@ -324,9 +322,9 @@ class _Part:
 
     @cached_property
     def _kept(self) -> list[int]:
-        """Return the indices of the rows that hold cells, up to what stands below the numbers.
+        """Return the indices of the rows that hold cells, up to the text below the numbers.
 
-        That begins with a word and is not as the rows above it.
+        That starts with a word and differs from the rows above it.
         """
         marks = tuple(m for m in _COMMENTS if m != self.layout.delimiter)
         kept = [k for k, row in enumerate(self.rows) if row.strip() and not row.startswith(marks)]
@@ -361,14 +359,14 @@ class _Part:
 
 
 def _with_unit(text: str, cells: Cells) -> str:
-    """Return a header's cell with the unit that only the cells below it tell.
+    """Return a header's cell with the unit that only the cells below it imply.
 
-    That is the second for dates and clock times, what stands behind the numbers, or what makes a
+    That is the second for dates and clock times, the unit behind the numbers, or what makes a
     number the time since 1970. In a cell in capitals the unit is written as it is: `TIME(S)`.
     """
-    item, unit = name_and_unit(text)
+    bare, unit = name_and_unit(text)
     if unit is not None and unit_named(unit) == "s" and ":" in unit:
-        return f"{item} [s]"
+        return f"{bare} [s]"
     capitals = _IN_BRACKETS.fullmatch(text.strip()) if text.isupper() else None
     name = understood(capitals["name"]) if capitals else None
     if capitals and name and not measures(name.column, capitals["unit"]):
@@ -382,13 +380,13 @@ def _with_unit(text: str, cells: Cells) -> str:
 
 
 def _unit_below(text: str, cells: Cells) -> str | None:
-    """Return the unit that the cells below a header's cell tell, None where they tell none."""
+    """Return the unit that the cells below a header's cell imply, None if they imply none."""
     if not isinstance(cells, np.ndarray):
         cells = [c for c in cells if c.strip()]
         if cells and is_stamp(cells[0]):
             return "s"
-        if item := unit_in(cells):
-            return item
+        if unit := unit_in(cells):
+            return unit
     name = understood(text)
     is_time = name is not None and name.column == "time"
     return unit_of_times(as_numbers(cells[:9], "s")) if is_time else None
@@ -416,7 +414,7 @@ def _in_rows(lines: Sequence[str], mark: str) -> Table | None:
 
 
 def decoded(data: bytes, path: str) -> str:
-    """Return the text in the content of a file: UTF-8, UTF-16 with or without a mark, Windows' own.
+    """Return the text of a file: UTF-8, UTF-16 with or without a mark, or Windows-1252.
 
     Raises:
         InputError: it is no text.
@@ -482,7 +480,7 @@ def instrument_lines(path: str, lines: Sequence[str]) -> Form:
 
 def stated_step(lines: Sequence[str]) -> float | None:
     """Return the time between samples [s] that the lines above a table state, None without one."""
-    result = set()
+    steps = set()
     for line in lines[:_MOST_LINES]:
         match = _STEP.fullmatch(line)
         if match is None or not match["name"].lower().lstrip("# ").startswith(_SAMPLES):
@@ -491,22 +489,21 @@ def stated_step(lines: Sequence[str]) -> float | None:
         unit = unit_named(match["unit"] or "") or unit_named(match["before"] or "")
         unit = unit or ("Hz" if is_rate else "s")
         try:
-            value = to_si(number, unit)
+            converted = to_si(number, unit)
         except InputError:
             continue
-        if 0.0 < value < 1e12:
-            result.add(1.0 / value if unit.endswith("Hz") or is_rate else value)
-    return result.pop() if len(result) == 1 else None
+        if 0.0 < converted < 1e12:
+            steps.add(1.0 / converted if unit.endswith("Hz") or is_rate else converted)
+    return steps.pop() if len(steps) == 1 else None
 
 
 def _tektronix(lines: Sequence[str]) -> Form:
-    """Return the time and the value of a channel, which stand beside the settings."""
+    """Return the time and the value of a channel, in columns next to the settings."""
     rows = [[cell.strip() for cell in line.split(",")] for line in lines]
-    table = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
-    unit, clock = (
-        unit_named(table.get(f"{axis} Units", "")) for axis in ("Vertical", "Horizontal")
-    )
-    name = table.get("Source") or "value"
+    settings = {row[0]: row[1] for row in rows if len(row) > 1 and row[0]}
+    unit = unit_named(settings.get("Vertical Units", ""))
+    clock = unit_named(settings.get("Horizontal Units", ""))
+    name = settings.get("Source") or "value"
     header = (f"time [{clock or 's'}]", f"{name} [{unit}]" if unit else name)
     return [",".join(row[3:5]) if len(row) > 4 else "" for row in rows], header, None
 
@@ -540,7 +537,7 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
     head = _entries(lines[: ends[0]], "[\t,]")
     mark = "," if head.get("Separator", [""])[0].lower() == "comma" else "\t"
     columns = head.get("X_Columns", ["One"])[0]
-    table, header = [""] * len(lines), ""
+    rows, header = [""] * len(lines), ""
     for start, end, stop in zip(ends, ends[1:], [*ends[2:], len(lines)], strict=False):
         segment = _entries(lines[start + 1 : end], mark)
         if end + 1 >= stop:
@@ -552,7 +549,7 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
                 " each part as a file of its own."
             )
         if not header:
-            table[end + 1] = header = names
+            rows[end + 1] = header = names
         for k, row in enumerate(lines[end + 2 : stop], end + 2):
             if not row.strip() or row.startswith("Channels"):  # the head of the next part
                 break
@@ -565,13 +562,13 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
                     " them on one time axis."
                 )
             cells += [""] * (header.count("\t") + 1 - len(cells))
-            table[k] = "\t".join(cells)
-    return table
+            rows[k] = "\t".join(cells)
+    return rows
 
 
 def _entries(lines: Sequence[str], mark: str) -> dict[str, list[str]]:
-    items = [[cell.strip() for cell in re.split(mark, line)] for line in lines]
-    return {key: values or [""] for key, *values in items}
+    rows = ([cell.strip() for cell in re.split(mark, line)] for line in lines)
+    return {key: values or [""] for key, *values in rows}
 
 
 def _labview_names(cells: Sequence[str], units: Sequence[str]) -> str:

@@ -169,7 +169,7 @@ def columns_figure(record: Signals, first: Sequence[str] = ()) -> Figure:
 
     Those named in `first` come first, where none is named the column to show.
     """
-    names = [*dict.fromkeys((*(first or (record.shown,)), *record.columns))][:_MOST_ROWS]
+    names = [*dict.fromkeys((*(first or (record.main_column,)), *record.columns))][:_MOST_ROWS]
     figure = sheet((9.0, max(4.5, 2.2 * len(names))), 100)
     for name, axes in zip(names, np.ravel(figure.subplots(len(names), 1)), strict=True):
         _curve(axes, record.time, record.columns[name], name, record.units.get(name, ""))
@@ -319,7 +319,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         name = _chosen(output, columns, result.shown)
         _curve(axes, result.time, columns[name], name, result.units.get(name, ""))
     elif isinstance(result, Signals):
-        name = _chosen(output, result.columns, result.shown)
+        name = _chosen(output, result.columns, result.main_column)
         _curve(axes, result.time, result.columns[name], name, result.units.get(name, ""))
     elif isinstance(result, Posterior):
         by_name = {f.name: f for f in result.figures}

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.design.experiment.experiment import ASKED, PLAYS, Informative, Separated
+from psa_casadi.design.experiment.experiment import CHANCE, PLAYS, Informative, Separated
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
 from psa_casadi.report.words.phrases import (
@@ -76,7 +76,7 @@ def _chances(design: Separated) -> tuple[str, ...]:
         return (text,)
     if design.plays is None:
         again = (
-            f"No record was found that is predicted to decide with {percent(ASKED)}, not even one"
+            f"No record was found that is predicted to decide with {percent(CHANCE)}, not even one"
             f" that is repeated {PLAYS[-1]} times: within these limits the effects look alike."
             " Widen the range of the inputs or the band, make the record longer, or lower the"
             " noise of the sensor."
@@ -84,7 +84,7 @@ def _chances(design: Separated) -> tuple[str, ...]:
     else:
         again = (
             f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
-            f" own, are predicted to name the cause with {percent(ASKED)} or more."
+            f" own, are predicted to name the cause with {percent(CHANCE)} or more."
         )
     return text, again
 

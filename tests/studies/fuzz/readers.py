@@ -34,7 +34,7 @@ from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, 
 from tests.export.fmu_models import model_named
 from tests.model.evidence_models import evident_model
 from tests.records.laboratory_bytes import gcs, hdf5, lvm, mat, named, npy, npz, parquet, tdms, xlsx
-from tests.records.reading_here import answered_by_fork
+from tests.records.reading_here import read_by_fork
 from tests.studies.fuzz.campaign import FALSE_PASS, Finding, Target
 from tests.studies.fuzz.damage import (
     WORDS,
@@ -157,7 +157,7 @@ def _read(suffix: str, data: bytes, folder: Path) -> Iterator[Finding]:
     """Read a record and yield what is unsound in it."""
     path = folder / f"r{suffix}"
     path.write_bytes(data)
-    with patch.object(apart, "answered_apart", answered_by_fork):
+    with patch.object(apart, "read_apart", read_by_fork):
         record = psa.read_record(path)
     yield from _unsound(record)
 
