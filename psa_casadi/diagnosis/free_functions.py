@@ -29,7 +29,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.parts import begun, follows
+from psa_casadi.identification.parts import fit_longer_parts, follows
 from psa_casadi.identification.result import with_told
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import is_place, ports_of
@@ -116,7 +116,7 @@ def formula_of(
     item = _told(result, of, place, task, base, effects, scale)
     if len(whole) < len(task.experiments):
         with suppress(PsaError):
-            fit = begun(result.hypothesis.fit, task.experiments, whole)
+            fit = fit_longer_parts(result.hypothesis.fit, task.experiments, whole)
             if follows(fit, whole):
                 added = [*effects, Attached(result.component, port)]
                 item = replace(item, model=model_of(base, fit, added, whole))

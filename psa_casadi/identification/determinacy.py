@@ -11,7 +11,7 @@ from psa_casadi.identification.fitting.unknowns import (
     LINEAR_PRIOR,
     LOG_PRIOR,
     memory_prior,
-    memory_sizes,
+    memory_starts,
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import autocovariance, convolved
@@ -215,7 +215,8 @@ def record_information(
     `start`), which a fit would estimate with their weak priors, and the sensor's offset can
     imitate; sigma [m] is the white noise. The record needs no displacement. Raises SimulationError.
     """
-    sizes = memory_sizes(model) if sizes is None else sizes
+    if sizes is None:
+        sizes = {n: size for n, (size, _) in memory_starts(model).items()}
     start = dict.fromkeys(sizes, 0.0) if start is None else start
     # loose steps would make information: errors of a large derivative look like a direction
     _, by_parameter, by_start = predict_record(

@@ -10,11 +10,16 @@ from psa_casadi.identification.combinations import Combination, free_combination
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.noise_found import noise_found
+from psa_casadi.identification.inputs import even_clock
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import record_rms, refit, relevelled
-from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
-from psa_casadi.identification.sampling import even_clock
+from psa_casadi.identification.result import (
+    MISSED,
+    Identification,
+    doubts_of,
+    noise_found,
+    with_told,
+)
 from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
@@ -23,9 +28,7 @@ from psa_casadi.identification.start.doubts import (
     doubtful_unit,
     doubtful_voltage,
     refuse_few,
-    refuse_other_time,
-    refuse_still,
-    refuse_wrapped,
+    refuse_unreadable,
 )
 from psa_casadi.identification.start.ordinary import (
     Hysteresis,
@@ -33,7 +36,7 @@ from psa_casadi.identification.start.ordinary import (
     chosen_start,
     forms_of,
 )
-from psa_casadi.identification.start.starting_points import linear_start
+from psa_casadi.identification.start.starting_points import LinearCandidate, linear_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
@@ -97,9 +100,7 @@ def identify(
     search with the best fit so far, which `warnings` then says. Raises InputError, SimulationError.
     """
     given_records = records_given(records)
-    refuse_still(given_records)
-    refuse_wrapped(given_records)
-    refuse_other_time(given_records)
+    refuse_unreadable(given_records)
     parts, cut = without_gaps(given_records)
     ready = [prepared(r) for r in parts]
     every = [r for r, _ in ready]
@@ -113,16 +114,12 @@ def identify(
     start = forms[0]
     experiments = with_levels([whole(r) for r in fitted], columns.fitted)
     experiments = loads_as_curves(start, experiments, progress)
-    linear = None
+    linear: tuple[LinearCandidate, ...] = ()
     if model is None:
         progress("starting values from the records")
         linear = linear_start(fitted, start.values)
     result, preferred = search_forms(
-        forms,
-        experiments,
-        linear=linear.candidates if linear else (),
-        thorough=True,
-        progress=progress,
+        forms, experiments, linear=linear, thorough=True, progress=progress
     )
     best, experiments = _on_even_clock(*relevelled(result.best, experiments), items)
     best = _with_own_levels(best, experiments, progress)

@@ -14,9 +14,14 @@ from psa_casadi.identification.experiments import (
     undecided,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit
-from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.parts import cut, ways
-from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
+from psa_casadi.identification.result import (
+    MISSED,
+    Identification,
+    doubts_of,
+    noise_found,
+    with_told,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent

@@ -82,14 +82,12 @@ def find_steps(records: Sequence[Record]) -> list[Step]:
 
     A step has two levels of voltage and a rise between them that takes less than 5 % of the hold.
     """
-    items = [s for r in records if (s := _step_of(r)) is not None]
-    return sorted(items, key=lambda s: abs(s.volts))
+    return sorted((s for r in records if (s := _step_of(r))), key=lambda s: abs(s.volts))
 
 
 def find_loops(records: Sequence[Record]) -> list[Loop]:
     """Return the records whose voltage goes up and down at even intervals, the slowest first."""
-    items = [loop for r in records if (loop := _loop_of(r)) is not None]
-    return sorted(items, key=lambda loop: loop.frequency)
+    return sorted((loop for r in records if (loop := _loop_of(r))), key=lambda o: o.frequency)
 
 
 def _step_of(record: Record) -> Step | None:
@@ -223,14 +221,12 @@ def _reasons(step: Step) -> list[tuple[str, float]]:
     last = max(int(STEADY_SHARE * n), 4)
     drift = abs(float(np.mean(g[-last:]) - np.mean(g[-2 * last : -last])))
     overshoot = float(np.max(g)) - 1.0
-    reasons = []
-    if drift > max(4.0 * noise / np.sqrt(last), 1e-12):
-        reasons.append(("truncated", drift))
-    if noise > 1e-9:
-        reasons.append(("noise", noise))
-    if overshoot > max(_OVERSHOOT, 6.0 * noise):
-        reasons.append(("ringing", 100.0 * overshoot))
-    return reasons
+    reasons = (
+        ("truncated", drift, drift > max(4.0 * noise / np.sqrt(last), 1e-12)),
+        ("noise", noise, noise > 1e-9),
+        ("ringing", 100.0 * overshoot, overshoot > max(_OVERSHOOT, 6.0 * noise)),
+    )
+    return [(name, size) for name, size, counts in reasons if counts]
 
 
 #: What the factors of the denominator stand for.
@@ -262,9 +258,9 @@ def mechanics_of(
         count = int(np.sum(roots.real >= 0.0))
         return alone, (note("growing_poles", count=count),)
     stiffness = np.array([1.0, k_P, k_P, k_B, k_B])
-    items = [dict(zip(_FACTORS, stiffness * f, strict=True)) for f in readings(roots)]
     ranked = []
-    for values in items:
+    for factors in readings(roots):
+        values = dict(zip(_FACTORS, stiffness * factors, strict=True))
         zero = (values["c_B"] + values["c_P"]) / (k_B + k_P)
         off = round(abs(zero - b_1) / max(abs(b_1), 1e-12), 6)
         ranked.append((off, -values["tau"], zero, values))
@@ -319,14 +315,6 @@ class Rates(NamedTuple):
     h: FloatArray
     h_rate: FloatArray
     branches: list[tuple[float, slice]]
-
-    @property
-    def inner(self) -> BoolArray:
-        """Marks the samples on branches (n,)."""
-        marked = np.zeros(len(self.u), dtype=np.bool_)
-        for _, branch in self.branches:
-            marked[branch] = True
-        return marked
 
 
 def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
@@ -414,12 +402,12 @@ def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
     """
     differentiated = [rates_of(loop, k) for loop in loops]
     rates = [r for r, _ in differentiated]
-    notes = [note for _, item in differentiated for note in item]
+    notes = [note for _, notes in differentiated for note in notes]
     crossed = [[(sign, _crossing(r, b)) for sign, b in r.branches] for r in rates]
-    pairs = [pair for item in crossed for pair in _periods(item)]
+    pairs = [pair for branches in crossed for pair in _periods(branches)]
     if not pairs:
-        observed = {sign for item in crossed for sign, at in item if at is not None}
-        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in observed]
+        signs = {sign for loop in crossed for sign, at in loop if at is not None}
+        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in signs]
         return HysteresisPart(notes=(*notes, note("no_crossing", branches=missing)))
     # eq. (29) less k u': h'_+ = A_i u'_+ + delta_i u_+,  h'_- = A_i u'_- - delta_i u_-
     each = np.array([_solved(up, down) for up, down in pairs])
@@ -455,12 +443,11 @@ def _periods(
     paired with the next rising one.
     """
     pairs = [
-        (first[0], first[1], then[1])
-        for first, then in pairwise(branches)
-        if first[0] * then[0] < 0.0 and first[1] is not None and then[1] is not None
+        (sign, at, then)
+        for (sign, at), (other, then) in pairwise(branches)
+        if sign * other < 0.0 and at is not None and then is not None
     ]
-    up_first = [(first, then) for sign, first, then in pairs if sign > 0.0]
-    return up_first or [(then, first) for _, first, then in pairs]
+    return [p[1:] for p in pairs if p[0] > 0.0] or [p[:0:-1] for p in pairs]
 
 
 def _solved(up: FloatArray, down: FloatArray) -> tuple[float, float]:
@@ -497,8 +484,10 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
     """
     h, argument = [np.empty(0)], [np.empty(0)]
     for r in rates:
-        largest = float(np.max(np.abs(r.h[r.inner])))
-        part: BoolArray = r.inner & (r.h > _CLEAR * largest)
+        inner: BoolArray = np.zeros(len(r.u), dtype=np.bool_)
+        for _, branch in r.branches:
+            inner[branch] = True
+        part: BoolArray = inner & (r.h > _CLEAR * float(np.max(np.abs(r.h[inner]))))
         part &= sign * r.u_rate > _CLEAR * float(np.max(np.abs(r.u_rate)))
         h.append(r.h[part])
         argument.append(A - (r.h_rate[part] - sign * delta * r.u[part]) / r.u_rate[part])
@@ -591,8 +580,8 @@ def in_forces(
             instead = kept.get(name, usual.values[name])
             notes.append(note("out_of_range", name=name, value=value, instead=instead,
                               unit=parameter.unit, low=low, high=high))  # fmt: skip
-    result = tuple(name for name in start.parameter_names if name in kept)
-    return usual.with_values(kept), result, notes
+    names = tuple(name for name in start.parameter_names if name in kept)
+    return usual.with_values(kept), names, notes
 
 
 #: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
@@ -601,18 +590,18 @@ _TIP = (0.8, 0.97)
 
 @dataclass(frozen=True, eq=False)
 class PaperIdentification:
-    """What the paper's method finds; None where it finds nothing.
+    """The result of the paper's method; None where it has none.
 
     `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15), `k` [m/V] is that of eq. (25).
-    `model` has all in forces; without a loop its f_H is 0, and what else was not found has
+    `model` has all in forces; without a loop its f_H is 0, and what else is not identified has
     ordinary values.
-    `found` names the parameters that the method set; `notes` tell what failed or is doubtful.
+    `identified` names the parameters that the method set; `notes` are what failed or is doubtful.
     """
 
     coefficients: Mapping[str, float] | None
     k: float | None
     model: Model
-    found: tuple[str, ...]
+    identified: tuple[str, ...]
     notes: tuple[Note, ...]
 
     @property
@@ -635,9 +624,9 @@ def paper_method(
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    model, result, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
-    output = (*doubts, *conditions(step, slowest, linear), *bend.notes, *notes)
-    return PaperIdentification(linear, k, model, result, output)
+    model, names, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
+    notes = [*doubts, *conditions(step, slowest, linear), *bend.notes, *notes]
+    return PaperIdentification(linear, k, model, names, tuple(notes))
 
 
 def identify_by_paper(
@@ -654,7 +643,7 @@ def identify_by_paper(
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
     experiments = tuple(whole(r) for r in records)
-    sigma, doubts, result = noise_levels(experiments), paper.notes, paper.found
+    sigma, doubts, result = noise_levels(experiments), paper.notes, paper.identified
     progress("the model on all records")
     try:
         best = fit(paper.model, experiments, [], sigma=sigma)

@@ -137,10 +137,10 @@ def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment,
     """
     shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
     whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
-    displayed = fit.shown(experiments) if whole else []
+    predicted = fit.predicted_channels(experiments) if whole else []
     for o in fit.channels:
         j = o.number
-        rows = ((k, experiments[k], displayed[k][:, j]) for k in whole)
+        rows = ((k, experiments[k], predicted[k][:, j]) for k in whole)
         started = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
         fitted = zip(o.records, o.parts, strict=True)
         items = [(k, p) for k, p in (*fitted, *started) if len(p) >= _TELLING]

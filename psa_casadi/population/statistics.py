@@ -149,18 +149,12 @@ def mixed_regression(
     ends = [
         solve_tau2(y, s, x, float(scipy.stats.chi2.ppf(0.5 + h * LEVEL / 2, dof))) for h in (1, -1)
     ]
+    tau, low, high = (float(np.sqrt(t)) * unit for t in (tau2, *ends))
     b, covariance, q = _weighted(y, s, x, tau2)
-    scale = max(1.0, q / dof)
+    covariance = covariance * max(1.0, q / dof) * unit**2
     q0 = _weighted(y, s, x, 0.0)[2]
-    return MixedFit(
-        b * unit,
-        covariance * scale * unit**2,
-        float(np.sqrt(tau2)) * unit,
-        (float(np.sqrt(ends[0])) * unit, float(np.sqrt(ends[1])) * unit),
-        q0,
-        float(scipy.stats.chi2.sf(q0, dof)),
-        dof,
-    )
+    p_value = float(scipy.stats.chi2.sf(q0, dof))
+    return MixedFit(b * unit, covariance, tau, (low, high), q0, p_value, dof)
 
 
 def solve_tau2(y: FloatArray, s: FloatArray, x: FloatArray, wanted: float) -> float:
@@ -202,12 +196,12 @@ _AT_ONCE = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """z (n,), its two-sided p value, the adjusted one, and which devices are told."""
+    """z (n,), its two-sided p value, the adjusted one, and which devices are outlying."""
 
     z: FloatArray
     p: FloatArray
     p_adjusted: FloatArray
-    found: BoolArray
+    outlying: BoolArray
 
 
 def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
@@ -221,14 +215,14 @@ def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     y, s = np.asarray(theta, dtype=float), np.asarray(errors, dtype=float)
     if y.size <= FEWEST:
         raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
-    result = np.zeros(y.size, dtype=np.bool_)
-    z, p, corrected = _tested(y, s, result)
+    apart = np.zeros(y.size, dtype=np.bool_)
+    z, p, corrected = _tested(y, s, apart)
     for _ in range(_ROUNDS):
-        more = result | (corrected < LIMIT)
-        if (more == result).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
+        more = apart | (corrected < LIMIT)
+        if (more == apart).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
             break
-        result = more
-        z, p, corrected = _tested(y, s, result)
+        apart = more
+        z, p, corrected = _tested(y, s, apart)
     return Outliers(z, p, corrected, corrected < LIMIT)
 
 

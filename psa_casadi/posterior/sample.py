@@ -158,10 +158,10 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     if not task.converged:
         doubts.append(note("start_cut_off"))
     for b in task.density.blocks:
-        if b.alike > _COLOURED:
+        if b.correlation_time > _COLOURED:
             named = column_of(task, b) if task.channel(b) != DISPLACEMENT else None
             record = task.experiments[b.record].record.name
-            doubts.append(note("coloured", record=record, worth=b.alike, output=named))
+            doubts.append(note("coloured", record=record, worth=b.correlation_time, output=named))
     held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
     if held:
         doubts.append(note("of_the_prior", names=held))

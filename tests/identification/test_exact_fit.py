@@ -52,8 +52,8 @@ def test_a_fit_tells_way_and_error_of_each_record() -> None:
     experiments = [whole(regular()), whole(jittered(SIGMA, 2))]
     result = fitted(experiments, SIGMA)
     assert [s.way for s in result.simulated] == [EXACT, STEPPER]
-    assert result.simulated[0].error <= allowed(experiments[0], SIGMA)
-    assert result.simulated[1].error <= allowed(experiments[1], SIGMA)
+    assert result.simulated[0].errors[0] <= allowed(experiments[0], SIGMA)
+    assert result.simulated[1].errors[0] <= allowed(experiments[1], SIGMA)
     assert not result.way.stepped
     assert result.rms == pytest.approx(SIGMA, rel=0.15)
 
@@ -66,7 +66,7 @@ def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
     gap = float(np.sqrt(np.mean((result.predicted(experiments)[0] - fine) ** 2)))
     limit = allowed(experiments[0], SIGMA)
     assert gap <= limit
-    assert gap <= 3.0 * result.simulated[0].error + 0.03 * limit
+    assert gap <= 3.0 * result.simulated[0].errors[0] + 0.03 * limit
 
 
 def simulated_by(found: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
@@ -80,7 +80,7 @@ def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None
     result = fitted(experiments, sigma)
     output = result.simulated[0]
     limit = allowed(experiments[0], sigma)
-    assert output.way == STEPPER or output.error <= limit
+    assert output.way == STEPPER or output.errors[0] <= limit
     fine = simulated_by(result, experiments, Way(1e-11, 1e-11, stepped=True))
     gap = result.predicted(experiments)[0] - fine
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit

@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Objective, fit
-from psa_casadi.identification.fitting.further import scaled
+from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose

@@ -126,7 +126,7 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
     monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
-    monkeypatch.setattr("psa_casadi.identification.exchanges._LAST", 1)
+    monkeypatch.setattr("psa_casadi.identification.mechanics._LAST", 1)
     result = identify([record])
     assert result.warnings[0].startswith("The fit was cut off before it converged")
 

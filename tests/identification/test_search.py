@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
+from psa_casadi.identification.mechanics import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from psa_casadi.units import FloatArray

@@ -25,7 +25,7 @@ from psa_casadi.components import BASE
 from psa_casadi.components.stack import BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.doubts import (
     doubtful_unit,
     refuse_unusable,
@@ -59,12 +59,12 @@ def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
             f"The model '{model.name}' has no hysteresis of its own to give another form; leave"
             " --hysteresis out."
         )
-    items = []
+    models = []
     for name in FORMS if hysteresis == "best" else (hysteresis,):
-        item = [FORMS[name] if c.name in known else c for c in model.components]
-        there = {c.name for c in item}
-        items.append(model.with_components(c for c in item if set(c.needs) <= there))
-    return tuple(items)
+        components = [FORMS[name] if c.name in known else c for c in model.components]
+        names = {c.name for c in components}
+        models.append(model.with_components(c for c in components if set(c.needs) <= names))
+    return tuple(models)
 
 
 #: Times T that are tried, over the sampling interval, and how often the grid closes in.
@@ -116,28 +116,29 @@ def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
     explained badly. Records with uneven time steps tell nothing.
     """
-    item = [
+    even = [
         r
         for r in records
         if r.current is not None
         and r.n > 3
         and np.ptp(np.diff(r.time)) < _UNEVEN * np.mean(np.diff(r.time))
     ]
-    items = [np.asarray(r.current, dtype=np.float64) for r in item]
-    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in items)
-    if total == 0.0:
-        return _by_charge(records)
-    times = min(r.sample_time for r in item) * _TIMES
+    currents = [np.asarray(r.current, dtype=np.float64) for r in even]
+    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in currents)
+    c = _by_current(even, total) if total else _by_charge(records)
+    followed = c and c.explained >= _EXPLAINED and _ORDINARY[0] < c.value < _ORDINARY[1]
+    return c if followed else None
+
+
+def _by_current(records: Sequence[Record], total: float) -> Capacitance:
+    """Return the capacitance at the best time T; `total` is the sum of squares of the currents."""
+    times = min(r.sample_time for r in records) * _TIMES
     for _ in range(_ROUNDS):
-        left = [_solved(item, float(q))[1] for q in times]
-        k = int(np.argmin(left))
+        k = int(np.argmin([_solved(records, float(q))[1] for q in times]))
         best = float(times[k])
         times = np.geomspace(times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)], len(_TIMES))
-    value, rest, error = _solved(item, best)
-    explained = 1.0 - rest / total
-    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
-        return None
-    return Capacitance(value, error, explained)
+    value, rest, error = _solved(records, best)
+    return Capacitance(value, error, 1.0 - rest / total)
 
 
 def _by_charge(records: Sequence[Record]) -> Capacitance | None:
@@ -150,11 +151,8 @@ def _by_charge(records: Sequence[Record]) -> Capacitance | None:
         return None
     value = sum(float(v @ q) for v, q in pairs) / power
     rest = sum(float(np.sum((q - value * v) ** 2)) for v, q in pairs)
-    explained = 1.0 - rest / total
-    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
-        return None
     # what is left is a loop, not noise: its width does not average out
-    return Capacitance(value, float(np.sqrt(rest / power)), explained, "charge")
+    return Capacitance(value, float(np.sqrt(rest / power)), 1.0 - rest / total, "charge")
 
 
 def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float]:
@@ -166,25 +164,25 @@ def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float
     for k, record in enumerate(records):
         keep = float(np.exp(-record.sample_time / time))
         rate = np.append(0.0, np.diff(record.voltage) / np.diff(record.time))
-        item = np.zeros((record.n, 1 + 2 * len(records)))
-        item[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
-        item[:, 1 + 2 * k] = 1.0
-        item[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
-        every.append(item)
+        block = np.zeros((record.n, 1 + 2 * len(records)))
+        block[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
+        block[:, 1 + 2 * k] = 1.0
+        block[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
+        every.append(block)
     columns = np.vstack(every)
     scale = np.linalg.norm(columns, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     columns /= scale
-    displayed = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
-    result, *_ = np.linalg.lstsq(columns, displayed, rcond=None)
-    rest = displayed - columns @ result
+    current = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
+    weights, *_ = np.linalg.lstsq(columns, current, rcond=None)
+    rest = current - columns @ weights
     power = float(rest @ rest)
     similar = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
     inflation = (1.0 + similar) / (1.0 - similar)
     spread = np.linalg.pinv(columns.T @ columns, hermitian=True)[0, 0]
     freedom = max(len(rest) - columns.shape[1], 1)
     error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
-    return float(result[0] / scale[0]), power, error
+    return float(weights[0] / scale[0]), power, error
 
 
 #: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
@@ -237,15 +235,15 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "n": LOOP_SHAPES[0]["n"],
     }
     try:
-        return compose(BASE, {**values, **_within(_lags(values, sample_time))})
+        return compose(BASE, {**values, **within_base(_lags(values, sample_time))})
     except InputError as error:
         raise InputError(stray(records) or [doubt]) if doubt else error from None
 
 
-def _within(lags: Mapping[str, float]) -> dict[str, float]:
-    """Return lags within the bounds of their parameters, however slow or fast the sampling is."""
+def within_base(values: Mapping[str, float]) -> dict[str, float]:
+    """Return values of some parameters of the base model, clipped to their bounds."""
     bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    return {name: float(np.clip(value, *bounds[name])) for name, value in lags.items()}
+    return {name: float(np.clip(value, *bounds[name])) for name, value in values.items()}
 
 
 def chosen_start(
@@ -262,9 +260,9 @@ def chosen_start(
     model = model.with_declared_starts()
     if stiffness is None:
         return model, model.provenance.force_scale == "given"
-    item = next(model.values[name] for name in ("k_B", "k") if name in model.values)
+    before = next(model.values[name] for name in ("k_B", "k") if name in model.values)
     forces = [p for p in model.structure.parameters if p.unit == "kg" or p.unit[:1] == "N"]
-    scaled = {p.name: model.values[p.name] * stiffness / item for p in forces}
+    scaled = {p.name: model.values[p.name] * stiffness / before for p in forces}
     return model.with_values(scaled), True
 
 
@@ -363,16 +361,16 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     low = np.array([_K[0], _N[0], *[-_DOUBT] * len(loops)])
     high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
     none = [0.0] * len(loops)
-    items = [
+    fits = [
         scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
         for start in _STARTS
     ]
-    best = min(items, key=lambda f: float(f.cost)).x
+    best = min(fits, key=lambda f: float(f.cost)).x
     s, beta, gamma, delta = parts(best)[0]
     k = best[0] * slope
     values = {"k_L": k, "A": s - k, "beta": beta, "gamma": gamma, "delta": delta}
     forces = {n: float(v) / compliance for n, v in values.items()} | {"n": float(best[1])}
-    return {n: float(np.clip(v, *model.parameter(n).bounds)) for n, v in forces.items()}
+    return within_bounds(model, forces)
 
 
 def _eliminated(

@@ -546,7 +546,7 @@ def posterior_file(posterior: Posterior) -> dict[str, Any]:
     task = posterior.task
     records = tuple(
         SampledRecord(
-            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.alike, b.level,
+            e.record.name, e.record.sha256, int(e.at(b.channel).sum()), b.correlation_time, b.level,
             task.channel(b).column, task.channel(b).unit,
         )
         for b in task.density.blocks

@@ -18,8 +18,8 @@ from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
 from psa_casadi.population.finding import (
     BudgetShare,
+    Estimate,
     Finding,
-    Found,
     HeldOutErrors,
     NamedCause,
     replayed,
@@ -142,7 +142,6 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
                 base.holdout_rms_m,
                 extended.holdout_rms_m,
                 d.noise_floor_rms_m,
-                base.holdout_nrmse_percent,
                 extended.holdout_nrmse_percent,
             )
         ]
@@ -155,7 +154,9 @@ def _diagnosis(d: AnyDiagnosisFile) -> Finding:
         device="",
         kind="diagnosis",
         parameters={
-            n: Found(p.value, p.unit, p.interval) for c in d.causes for n, p in c.parameters.items()
+            n: Estimate(p.value, p.unit, p.interval)
+            for c in d.causes
+            for n, p in c.parameters.items()
         },
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
@@ -175,7 +176,9 @@ def _identification(i: IdentificationFile) -> Finding:
         device="",
         kind="identification",
         parameters={
-            n: Found(p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning)
+            n: Estimate(
+                p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning
+            )
             for n, p in i.parameters.items()
         },
         records=tuple(dict.fromkeys((r.name, r.sha256) for r in i.records)),
@@ -183,7 +186,7 @@ def _identification(i: IdentificationFile) -> Finding:
         rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
         notes=(*i.warnings, *i.notes),
         warnings=i.warnings,
-        missed=i.missed,
+        noise_ratio=i.missed,
     )
 
 
@@ -196,7 +199,7 @@ def _model(model: Model, traces: bool) -> Finding:
         device="",
         kind="model",
         parameters={
-            p.name: Found(
+            p.name: Estimate(
                 model.values[p.name],
                 p.unit,
                 (i.low, i.high) if (i := origin.intervals.get(p.name)) else None,
@@ -275,9 +278,9 @@ def finding_content(finding: Finding) -> dict[str, Any]:
         for name in ("base", "extended", "noise"):
             row[f"{output}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = finding.rms_m, finding.rms_percent
-    row["missed [times the noise]"] = finding.missed
+    row["missed [times the noise]"] = finding.noise_ratio
     for name, p in finding.parameters.items():
-        if p.told and p.interval is not None:
+        if p.determined and p.interval is not None:
             row[f"{name} [{p.unit}]"] = p.value
             row[f"{name} low"], row[f"{name} high"] = p.interval
     return row

@@ -194,7 +194,7 @@ def _replica(before: Task, truth: FloatArray, noise: float, seed: int) -> Replic
     apart = np.abs(below.mean(axis=0) - 0.5)
     inside = tuple(tuple(bool(a <= 0.5 * level) for level in LEVELS) for a in apart)
     ranks = tuple(below[::THIN].sum(axis=0).tolist())
-    return Replica(ranks, inside, chains.divergences, task.density.blocks[0].alike)
+    return Replica(ranks, inside, chains.divergences, task.density.blocks[0].correlation_time)
 
 
 def _ranks(found: Sequence[Replica]) -> TitledTable:

@@ -1,4 +1,4 @@
-"""Lags and oscillators that may stand in each other's place: the exchanges of a stack's model.
+"""Mechanics fitted again: factors of the linear part exchanged, and from the fit's own force.
 
 The linear part is a product, eqs. (13), (15), so that two of its factors can change places with
 little effect: the two oscillators differ in the zero alone; the drive's lag stands before the
@@ -8,10 +8,18 @@ oscillator has a slow pole that looks like a lag. A search from one start may en
 Beside a fast oscillator, that slow pole of lag c/k brings a zero of lag c/k k_P/(k_P + k_B), or
 c/k k_B/(k_P + k_B). Where the creep lag cancels the zero, the pole alone is left: it may be the
 creep lag, and the oscillator as fast as the other one.
+
+Two resonances within the band, a lag and the zero between them give a fit many local minima, most
+of them far above the noise. There the force is nearly right: what it has of the voltage's history
+is quasi-static and hardly depends on the mechanics. So the fit's own force, simulated, takes the
+voltage's place in `linear_start`: poles by vector fitting, placed, refined with the ratio k_P/k_B
+free, and a full fit from each of the best. The play operators of `starting_points` then stand for
+what is wrong with that force. A better fit has a better force.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import log
 
 import casadi as ca
 import numpy as np
@@ -19,17 +27,26 @@ import numpy as np
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.prediction import predict
-from psa_casadi.identification.fitting.unknowns import unknowns_of
+from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.identification.fitting.unknowns import (
+    static_compliance,
+    unknowns_of,
+    within_bounds,
+)
 from psa_casadi.identification.refitting import (
     differing,
     equal,
     quick_from,
+    record_rms,
+    refit,
     refit_or_keep,
+    residual_noise,
 )
+from psa_casadi.identification.start.linear_response import oscillators
+from psa_casadi.identification.start.starting_points import Excerpt, fastest_part, placed, sought
 from psa_casadi.progress import Progress
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
+from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
 from psa_casadi.units import FloatArray
 
@@ -75,16 +92,16 @@ def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) 
     """Free the fast parameters that these records can tell, if that lowers the cost clearly."""
     free = best.unknowns.names
     available = [n for n in FAST if n in best.model.values and n not in (*free, "k_P")]
-    items = [n for n in available if _can_tell(best, experiments, n)]
-    if not items:
+    more = [n for n in available if _would_determine(best, experiments, n)]
+    if not more:
         return best
-    progress(f"base fit with {', '.join(items)}")
+    progress(f"base fit with {', '.join(more)}")
     states = best.starts()
     try:
-        wider = fit(best.model, experiments, [*free, *items], sigma=best.sigma, start_states=states)
+        wider = fit(best.model, experiments, [*free, *more], sigma=best.sigma, start_states=states)
     except PsaError:
         return best
-    needed = len(items) * np.log(len(best.residuals))
+    needed = len(more) * np.log(len(best.residuals))
     return wider if wider.interrupted or wider.data_cost < best.data_cost - needed else best
 
 
@@ -113,8 +130,7 @@ def exchanged(
         before = best
         for what, values in exchanges(best.model.values):
             progress(f"exchanged: {what}")
-            bounds = {n: best.model.parameter(n).bounds for n in values}
-            moved = {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
+            moved = within_bounds(best.model, values)
             other = quick_from(
                 best, best.model.with_values(moved), experiments, best.unknowns.names,
                 start_states=best.starts(), evaluations=_FIRST,
@@ -138,7 +154,7 @@ def exchanged(
     return best, ()
 
 
-def _can_tell(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
+def _would_determine(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
     """Whether a further parameter would have a standard error below half a logarithmic unit."""
     known, count = best.unknowns, len(best.unknowns.names)
     none: list[dict[str, float]] = [{} for _ in experiments]
@@ -177,3 +193,132 @@ def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
     force = ca.Function("force", [s.time, s.x, s.u, s.p], [s.sums["free_force"]])
     values = force(record.time[None, :], states, inputs, fit.model.parameter_vector())
     return np.asarray(values, dtype=np.float64).reshape(-1)
+
+
+#: Samples that one record and all together may have, and the fewest that count.
+_MOST, _ALL, _FEWEST = 6_000, 12_000, 16
+#: Share of them that is given to the transient: from the record's start, and from amid it.
+_LEAD, _AMID = 0.01, 0.2
+#: Records sampled this much more slowly than the fastest add no dynamics.
+_SLOWER = 30.0
+#: Orders of vector fitting.
+_ORDERS = (2, 3, 4, 5, 6)
+#: How many starts get a few evaluations, how many of these a full refinement.
+_REFINEMENTS = ((12, 6), (4, 25))
+#: How many full fits are begun, with how many evaluations, how many of them are ended, and rounds.
+_BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
+#: The fit misses something where its rms is this much above the noise; a better one lowers the
+#: cost, twice the log-likelihood, by more than this.
+_MISSED, _BETTER = 1.01, 20.0
+#: Share of the rms that is taken for noise at least.
+_FLOOR = 0.1
+_FREE = ("m_P", "m_B", "k_P")
+_FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
+
+
+def retuned(
+    best: Fit, experiments: Sequence[Experiment], progress: Progress, *, reached: float = np.inf
+) -> Fit:
+    """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
+
+    It is sought while records miss more than their own fast part, which holds some of a misfit's
+    ringing, or than the rms [m] that another model has `reached`. Needs two resonators (k_P, k_B);
+    records on instants that are not uniform do not contribute. A keyboard interrupt ends it at the
+    best fit so far.
+    """
+    if "k_P" not in best.model.values:
+        return best
+    for _ in range(_REPEATS):
+        levels = residual_noise(best, experiments)
+        pairs = zip(record_rms(best, experiments), levels, strict=True)
+        misfit = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
+        if best.interrupted or not misfit:
+            return best
+        progress("base fit, mechanics again behind the force found")
+        try:
+            better = _once(best, experiments)
+        except KeyboardInterrupt:
+            return replace(best, interrupted=True)
+        except (PsaError, np.linalg.LinAlgError):
+            return best
+        if better is None or better.data_cost > best.data_cost - _BETTER:
+            return best
+        best = better
+    return best
+
+
+def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
+    parts = list(_parts(best, experiments))
+    if not parts:
+        return None
+    ratio = log(best.model.values["k_P"] / best.model.values["k_B"])
+    starts = [s for e in parts for s in placed(e, e.v, _ORDERS, (ratio, -ratio), weak=False)]
+    names = list(dict.fromkeys([*best.unknowns.names, *_FREE]))
+    forces = {s.name for s in best.model.structure.states if s.unit == "N"}
+    fits = []
+    for linear in sought(parts, starts, _REFINEMENTS, ratio_free=True)[0][:_BEGUN]:
+        values = _values(best, linear.theta)
+        scale = values["k_L"] / best.model.values["k_L"]  # memories of forces change with them
+        states = [
+            {n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()
+        ]
+        quick = quick_from(
+            best, best.model.with_values(values), experiments, names,
+            start_states=states, evaluations=_QUICK,
+        )  # fmt: skip
+        fits += [quick] if quick else []
+    nearest = sorted(fits, key=lambda f: f.data_cost)[:_ENDED]
+    ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in nearest]
+    if any(f.interrupted for f in (*nearest, *ended)):
+        raise KeyboardInterrupt
+    return min(ended, key=lambda f: f.data_cost, default=None)
+
+
+def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
+    """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
+    fastest = min(e.record.sample_time for e in fitted(experiments))
+    values, levels, total = best.model.values, residual_noise(best, experiments), 0
+    for k, e in enumerate(experiments):
+        record, y = e.record, measured(e.record)
+        steps, there = np.diff(record.time), np.isfinite(y)
+        uneven = np.ptp(steps) > 0.01 * record.sample_time
+        if uneven or record.sample_time > _SLOWER * fastest or total >= _ALL:
+            continue
+        first = fastest_part(record.voltage, _MOST) if y.size > _MOST else 0
+        cut = slice(first, first + _MOST)
+        valid = (e.used & there)[cut]
+        valid[: max(1, int((_AMID if first else _LEAD) * valid.size))] = False
+        if valid.sum() < _FEWEST or not np.ptp(record.voltage[cut][valid]):
+            continue
+        force = force_of(best, k, record)
+        source = (force[cut] - force[cut][0]) * static_compliance(values)
+        filled = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
+        level = max(levels[k], _FLOOR * best.rms)
+        total += valid.size
+        yield Excerpt(
+            name=record.name,
+            h=record.duration / steps.size,
+            longest=record.duration,
+            v=source,
+            y=filled[cut] - filled[cut][0],
+            valid=valid,
+            sigma=level,
+            loop=source,
+            static=best.rms,
+        )
+
+
+def _values(best: Fit, theta: FloatArray) -> dict[str, float]:
+    """Return the parameters of theta, forces scaled to keep the displacement.
+
+    Of the two lags behind the force the slower is the creep lag; the other one is added to the
+    drive's.
+    """
+    p = best.model.values
+    one, two, *_, ratio = np.exp(theta).tolist()
+    k_b, k_p = p["k_B"], ratio * p["k_B"]
+    lags = {"tau": max(one, two), "R_s": p["R_s"] + min(one, two) / p["C_p"]}
+    table = {**lags, "k_P": k_p, **oscillators(theta, k_p, k_b)}
+    scale = static_compliance(p) / static_compliance({**p, **table})
+    table |= {n: scale * p[n] for n in _FORCES if n in p}
+    return within_bounds(best.model, table)
