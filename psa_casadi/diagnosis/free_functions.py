@@ -30,7 +30,7 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.parts import fit_longer_parts, follows
-from psa_casadi.identification.result import with_told
+from psa_casadi.identification.result import with_origin
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import is_place, ports_of
 from psa_casadi.records.split import Experiment
@@ -58,7 +58,7 @@ def model_of(
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
     sure, inputs = determinacy(fit, experiments), [e.record for e in experiments]
-    return with_told(
+    return with_origin(
         model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
     )  # fmt: skip

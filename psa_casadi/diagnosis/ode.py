@@ -23,9 +23,9 @@ from psa_casadi.diagnosis.search.rivals import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.experiments import (
+    column_notes,
     experiments_of,
     given_to,
-    told_of_columns,
     undecided,
 )
 from psa_casadi.identification.fitting.fit import Fit
@@ -132,7 +132,7 @@ def diagnose_ode(
         *notes,
         *judge.known.remarks,
         *_entering(judge.final.view.of),
-        *told_of_columns(model, judge.experiments),
+        *column_notes(model, judge.experiments),
     )
     return answer.with_noise(noise, remarks)
 

@@ -245,31 +245,24 @@ def advice(
 class _Adviser:
     """The information at hand and in every plan, for the fit's parameters and the fixed lags."""
 
-    def __init__(self, fit: Fit, experiments: Sequence[Experiment], found: Determinacy) -> None:
-        self._fit, self._found, self._experiments = fit, found, experiments
-        extra = [n for n in SEARCHABLE if n in fit.model.values and n not in found.names]
-        self._names = (*found.names, *extra)
+    def __init__(self, fit: Fit, experiments: Sequence[Experiment], of: Determinacy) -> None:
+        self._fit, self._determinacy, self._experiments = fit, of, experiments
+        extra = [n for n in SEARCHABLE if n in fit.model.values and n not in of.names]
+        self._names = (*of.names, *extra)
         self._noise = max(fit.rms, min(fit.sigma))
-        known, count = self._at_hand(fit.model), len(found.names)
+        known, count = self._at_hand(fit.model), len(of.names)
         # by how much the residuals' level and colour widen the intervals, squared
-        prior = prior_information(fit.model, found.names)
-        white = standard_errors(known[:count, :count] + prior)
-        sizes = np.abs(sizes_of(fit.model, found.names))
-        output = np.array([found.standard_errors[n] for n in found.names]) / sizes
-        sure = output < DETERMINED_WIDTH
-        ratio = max(float(np.median((output / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
+        white = standard_errors(known[:count, :count] + prior_information(fit.model, of.names))
+        sizes = np.abs(sizes_of(fit.model, of.names))
+        relative = np.array([of.standard_errors[n] for n in of.names]) / sizes
+        sure = relative < DETERMINED_WIDTH
+        ratio = max(float(np.median((relative / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
         errors = standard_errors(known / ratio + prior_information(fit.model, self._names))
-        self._open = {
-            n
-            for k, n in enumerate(self._names)
-            if n in found.undetermined or (n in extra and errors[k] > DETERMINED_WIDTH)
-        }
-        self._scenarios = scenarios(fit.model, self._open)
+        wide = {n for n, e in zip(self._names, errors, strict=True) if e > DETERMINED_WIDTH}
+        self._open = {*of.undetermined, *(wide & set(extra))}
+        self._scenarios = scenarios(fit.model, self._open) if self._open else []
         self._known = np.array(
-            [
-                self._at_hand(m) / ratio + prior_information(m, self._names)
-                for m in (self._scenarios if self._open else ())
-            ]
+            [self._at_hand(m) / ratio + prior_information(m, self._names) for m in self._scenarios]
         )
 
     def _at_hand(self, model: Model) -> FloatArray:
@@ -299,13 +292,13 @@ class _Adviser:
             known, counts[plan] = known + information, 1
             instead = tuple(  # plans of the other fast kind that do as well at the same rate
                 other
-                for other, item in options
+                for other, its_information in options
                 if other.rate == plan.rate
                 and {other.kind, plan.kind} == {"step", "multisine"}
-                and set(gain) <= set(self._gain(self._known + item, self._open))
+                and set(gain) <= set(self._gain(self._known + its_information, self._open))
             )
             results.append(Advice("single", gain, plan, instead=instead))
-        wanted = left & set(self._found.names)
+        wanted = left & set(self._determinacy.names)
         while wanted and (more := self._more(options, known, wanted)) is not None:
             plan, information, repeats = more
             known = known + repeats * information

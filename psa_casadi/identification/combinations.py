@@ -180,8 +180,8 @@ def free_combinations(
 class _Judge:
     """Standard errors of formulas, from the covariance of the values."""
 
-    def __init__(self, model: Model, found: Determinacy) -> None:
-        self._model, self._found = model, found
+    def __init__(self, model: Model, determinacy: Determinacy) -> None:
+        self._model, self._determinacy = model, determinacy
 
     def known(self, formula: Formula) -> tuple[Combination, float] | None:
         """Return what is known far better than its parameters, else None.
@@ -189,7 +189,7 @@ class _Judge:
         With it comes a rank, the smallest for a formula that is sure and short: its standard error
         over what one of the parameters would make it, doubled by each parameter that is free.
         """
-        result, names = self._found, self._found.names
+        result, names = self._determinacy, self._determinacy.names
         order = formula.names if formula.physical else names
         free = [n for n in order if n in names and n in formula.names]
         values, gradient = self._model.values, np.zeros(len(names))
@@ -218,7 +218,8 @@ class _Judge:
             for member in group:  # grows while it is walked
                 group += [n for n in left if self._tied(member, n)]
                 left = [n for n in left if n not in group]
-            others = [n for n in self._found.names if n not in names and self._tied(group[0], n)]
+            other_names = [n for n in self._determinacy.names if n not in names]
+            others = [n for n in other_names if self._tied(group[0], n)]
             if len(group) > 1:
                 yield Combination("group", tuple(group))
             elif others:
@@ -230,12 +231,12 @@ class _Judge:
 
     def relative(self, name: str) -> float:
         """Return a parameter's standard error over its value."""
-        return self._found.standard_errors[name] / self._size(name)
+        return self._determinacy.standard_errors[name] / self._size(name)
 
     def _size(self, name: str) -> float:
         values = self._model.values
         return abs(values[name]) or self._model.parameter(name).typical(values)
 
     def _tied(self, one: str, other: str) -> bool:
-        row, column = self._found.names.index(one), self._found.names.index(other)
-        return bool(one != other and abs(self._found.correlations[row, column]) > TIED)
+        row, column = (self._determinacy.names.index(n) for n in (one, other))
+        return bool(one != other and abs(self._determinacy.correlations[row, column]) > TIED)

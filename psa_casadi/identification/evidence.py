@@ -112,26 +112,25 @@ def _interval(columns: Sequence[FloatArray]) -> Interval:
 
 
 def _reference(model: Model, record: Record) -> ReferenceRun:
-    """Return the longest first part of a record whose voltage so few samples tell."""
+    """Return the longest first part of a record whose voltage `_LONGEST` samples interpolate."""
     stride = 1
-    while stride < record.n // 8 and _told_by(record, 2 * stride):
+    while stride < record.n // 8 and _is_interpolated(record, 2 * stride):
         stride *= 2
     kept = np.arange(0, min(record.n, _LONGEST * stride), stride)
     columns = {n: getattr(record, n, None) for n in model.input_names}
-    inputs = {n: _rounded(c[kept]) for n, c in columns.items() if c is not None}
-    displayed = measured(record)[kept]
-    valid = np.isfinite(displayed)
-    digits = iter(_rounded(displayed[valid]))
+    y = measured(record)[kept]
+    valid = np.isfinite(y)
+    rounded = iter(_rounded(y[valid]))
     return ReferenceRun(
         record=record.name,
         time=tuple(round(float(t), 12) for t in record.time[kept] - record.time[0]),
-        inputs=inputs,
-        displacement=tuple(next(digits) if v else None for v in valid),
+        inputs={n: _rounded(c[kept]) for n, c in columns.items() if c is not None},
+        displacement=tuple(next(rounded) if v else None for v in valid),
     )
 
 
-def _told_by(record: Record, stride: int) -> bool:
-    """Whether every so many samples tell the voltage that lies between them."""
+def _is_interpolated(record: Record, stride: int) -> bool:
+    """Whether straight lines between every `stride`-th sample follow the voltage."""
     part = slice(0, min(record.n, (_LONGEST - 1) * stride + 1))
     time, voltage = record.time[part], record.voltage[part]
     lines = np.interp(time, time[::stride], voltage[::stride])

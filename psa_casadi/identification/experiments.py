@@ -84,9 +84,9 @@ def experiments_of(
         channel = Channel(
             o.name, o.unit, (o.name,), straight=STRAIGHT, offset=o.name in zeros, factors=False
         )
-        items = [replace(e, channels=(channel,)) for e in result]
-        fitted_ones = np.concatenate([e.measured(0)[e.at(0)] for e in items])
-        spread = float(np.std(fitted_ones)) if fitted_ones.size else 0.0
+        alone = [replace(e, channels=(channel,)) for e in result]
+        readings = np.concatenate([e.measured(0)[e.at(0)] for e in alone])
+        spread = float(np.std(readings)) if readings.size else 0.0
         if spread > 0.0:
             channels.append(replace(channel, level=_FIRST_LEVEL * spread))
     if not channels:
@@ -121,7 +121,7 @@ def varied(model: Model, e: Experiment) -> str | None:
     return most if most is not None and spans[most] > 0 else None
 
 
-def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
+def column_notes(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
     """Return which inputs look held between samples and are read as lines, which outputs lack.
 
     And what units were not stated, and which samples are masked.
@@ -151,7 +151,7 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
 
 def _units(model: Model) -> dict[str, str]:
     inputs, outputs = model.structure.inputs, model.structure.outputs
-    return {**{v.name: v.unit for v in inputs}, **{v.name: v.unit for v in outputs}}
+    return {v.name: v.unit for v in inputs} | {v.name: v.unit for v in outputs}
 
 
 def in_units(model: Model, s: Signals, problems: Problems) -> Signals:

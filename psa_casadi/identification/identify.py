@@ -18,7 +18,7 @@ from psa_casadi.identification.result import (
     Identification,
     doubts_of,
     noise_found,
-    with_told,
+    with_origin,
 )
 from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
@@ -194,7 +194,7 @@ def with_provenance(
     fits = current is not None and current.source == "current" and current.is_that_of(c_p)
     output = {"C_p": current.interval} if current is not None and fits else {}
     return replace(
-        with_told(
+        with_origin(
             model, records, result.names, {**output, **result.intervals},
             force_scale="given" if stiffness_given else "assumed",
             interrupted=interrupted,
@@ -210,7 +210,7 @@ def with_provenance(
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
     """Return the model of the best fit so far, marked as that of a search that was interrupted."""
-    return with_told(
+    return with_origin(
         best.model, records, best.unknowns.names, {},
         force_scale="given" if stiffness_given else "assumed",
         notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),

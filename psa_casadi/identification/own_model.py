@@ -8,9 +8,9 @@ import numpy as np
 
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import (
+    column_notes,
     experiments_of,
     given_to,
-    told_of_columns,
     undecided,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit
@@ -20,7 +20,7 @@ from psa_casadi.identification.result import (
     Identification,
     doubts_of,
     noise_found,
-    with_told,
+    with_origin,
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -71,7 +71,7 @@ def identify_ode(
     )  # fmt: skip
     matches = determinacy(best, runs)
     result = Identification(
-        model=with_told(
+        model=with_origin(
             best.model, [e.record for e in runs], matches.names, matches.intervals,
             force_scale="given", interrupted=best.interrupted,
         ),
@@ -85,7 +85,7 @@ def identify_ode(
     doubts = (
         *doubts_of(best, matches, outcomes),
         *_of_outputs(result),
-        *told_of_columns(model, runs),
+        *column_notes(model, runs),
     )
     noise = () if best.interrupted else noise_found(best, runs, signals)
     return replace(result, doubts=doubts, notes=(*statement, *notes_of(noise)), noise_kinds=noise)

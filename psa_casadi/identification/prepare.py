@@ -114,7 +114,7 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
                 f"The records have the column '{column}', but the model '{model.name}' does not"
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
-        elif why := _says_nothing(column, items):
+        elif why := _useless(column, items):
             statement.append(note(why, column=column))
         else:
             model = wider
@@ -140,7 +140,7 @@ def with_levels(
     return tuple(e.beside(levels) for e in experiments)
 
 
-def _says_nothing(column: str, records: Sequence[Record]) -> str:
+def _useless(column: str, records: Sequence[Record]) -> str:
     """Return why a column is no use, as the code of a note, "" where it is."""
     if all(float(np.ptp(getattr(r, column))) == 0.0 for r in records):
         return "still_column"

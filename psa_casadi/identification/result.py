@@ -89,7 +89,7 @@ class Identification(Reported):
     @cached_property
     def rms(self) -> Mapping[str, float]:
         """What is left of every measured output over all records (rms), in its unit."""
-        return rms_left(self.fit, self.experiments)
+        return residual_rms(self.fit, self.experiments)
 
     @cached_property
     def noise(self) -> Mapping[str, float]:
@@ -129,7 +129,7 @@ class Identification(Reported):
         return json_text(self.to_dict())
 
 
-def rms_left(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+def residual_rms(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
     """Return what a fit leaves of every measured output over all records (rms), in its unit."""
     table = {}
     for o in fit.channels:
@@ -161,7 +161,7 @@ def doubts_of(
     return [*items, note("undetermined", names=alone)] if alone else items
 
 
-def with_told(
+def with_origin(
     model: Model,
     records: Sequence[Record | Signals],
     free: Sequence[str],

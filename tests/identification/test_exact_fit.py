@@ -69,9 +69,9 @@ def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
     assert gap <= 3.0 * result.simulated[0].errors[0] + 0.03 * limit
 
 
-def simulated_by(found: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
+def simulated_by(fit: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
     """Return the prediction (n,) of the first record on another way."""
-    return replace(found, way=way).predicted(experiments)[0]
+    return replace(fit, way=way).predicted(experiments)[0]
 
 
 @pytest.mark.parametrize("sigma", [1e-9, 1e-12])
@@ -134,10 +134,10 @@ def columns(name: str, tolerance: float) -> tuple[list[str | int], FloatArray, F
     return unknowns, exact_steps.sensitivity[:, 0], item.sensitivity[:, 0]
 
 
-def off(found: FloatArray, true: FloatArray) -> float:
+def off(array: FloatArray, true: FloatArray) -> float:
     """Return the largest difference over the column's largest value; 0 for columns of zeros."""
     size = float(np.abs(true).max())
-    gap = float(np.abs(found - true).max())
+    gap = float(np.abs(array - true).max())
     return gap / size if size > 0.0 else gap
 
 

@@ -176,7 +176,7 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
     experiments = divided(records[:2], [replace(held, displacement=wrong)])
     result = fitted(model, experiments)
-    shared, item = result.predicted(experiments)[2], _from_its_own_beginning(result, experiments[2])
+    shared, item = result.predicted(experiments)[2], _from_first_tenth(result, experiments[2])
     truth = np.asarray(held.displacement)[~lead]
     errors = [float(np.std(x[~lead] - truth)) for x in (shared, item)]
     assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
@@ -184,14 +184,14 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     other = record_of(model, 5)
     apart = divided(records[:2], [replace(other, voltage=other.voltage + 5.0)])
     elsewhere = fitted(model, apart)
-    plain = _from_its_own_beginning(elsewhere, apart[2])
+    plain = _from_first_tenth(elsewhere, apart[2])
     np.testing.assert_allclose(elsewhere.predicted(apart)[2], plain, rtol=0, atol=0.1 * SIGMA)
 
 
-def _from_its_own_beginning(found: Fit, held: Experiment) -> FloatArray:
+def _from_first_tenth(whole_fit: Fit, held: Experiment) -> FloatArray:
     """The prediction of a record whose start and offset are fitted to its first tenth."""
     lead = Experiment(held.record, held.known, held.held_out)
-    return fit(found.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
+    return fit(whole_fit.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
 
 
 def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
@@ -256,7 +256,7 @@ def test_a_stack_that_never_settles_leaves_no_start_open(monkeypatch: pytest.Mon
 def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     """What tries a fit tries the next one then."""
     monkeypatch.setattr(
-        "psa_casadi.identification.fitting.fit.motions_of", lambda *given: {"f": 1 / 0.0}
+        "psa_casadi.identification.fitting.fit.motions_of", lambda *_: {"f": 1 / 0.0}
     )
     record = record_of(model_with(), 1)
     with pytest.raises(SimulationError, match="numbers of the fit overflow"):

@@ -151,7 +151,7 @@ def test_a_turned_sign_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("now", "then", "said"),
+    ("now", "then", "sentence"),
     [
         ({}, {}, "agrees with the model"),
         ({"slow_creep": 1.0}, {"slow_creep": 1.0}, "changes no name; it adds 7 "),
@@ -166,8 +166,8 @@ def test_a_turned_sign_is_told() -> None:
         ),
     ],
 )
-def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
-    assert said in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
+def test_decisions_in_words(now: dict[str, float], then: dict[str, float], sentence: str) -> None:
+    assert sentence in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
 
 
 def test_a_column_explains_nothing_where_something_is_left() -> None:

@@ -86,7 +86,7 @@ def loops() -> list[Record]:
 
 
 @pytest.fixture(scope="module")
-def found() -> StackIdentification:
+def identification() -> StackIdentification:
     return identify(loops())
 
 
@@ -101,14 +101,14 @@ def test_every_record_has_its_own_noise_level() -> None:
     assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
-def test_what_loops_leave_open_is_told_in_words(found: StackIdentification) -> None:
-    assert found.fit.converged
+def test_what_loops_leave_open_is_told_in_words(identification: StackIdentification) -> None:
+    assert identification.fit.converged
     lags = {"tau", "R_s", "c_P", "c_B"}
-    assert lags & set(found.determinacy.undetermined)
-    assert any("determined by these records" in w for w in found.warnings)
-    assert any(lags & set(c.parameters) for c in found.combinations)
-    assert any("step" in a.sentence or "multisine" in a.sentence for a in found.advice)
-    assert any(s.agrees for s in found.starts)
+    assert lags & set(identification.determinacy.undetermined)
+    assert any("determined by these records" in w for w in identification.warnings)
+    assert any(lags & set(c.parameters) for c in identification.combinations)
+    assert any("step" in a.sentence or "multisine" in a.sentence for a in identification.advice)
+    assert any(s.agrees for s in identification.starts)
 
 
 def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +137,7 @@ def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch)
     assert threading.active_count() < 20
 
 
-def test_drop_outs_and_outliers_do_not_move_the_fit(found: StackIdentification) -> None:
+def test_drop_outs_and_outliers_do_not_move_the_fit(identification: StackIdentification) -> None:
     spoiled = []
     for k, r in enumerate(loops()):
         y = np.array(r.displacement)
@@ -148,6 +148,6 @@ def test_drop_outs_and_outliers_do_not_move_the_fit(found: StackIdentification) 
     again = identify(spoiled)
     assert any("masked" in s for s in again.sentences)
     for name in ("k_L", "A", "n"):
-        error = found.determinacy.standard_errors[name]
-        assert abs(again.model.values[name] - found.model.values[name]) < 3.0 * error
-    assert again.fit.rms == pytest.approx(found.fit.rms, rel=0.05)
+        error = identification.determinacy.standard_errors[name]
+        assert abs(again.model.values[name] - identification.model.values[name]) < 3.0 * error
+    assert again.fit.rms == pytest.approx(identification.fit.rms, rel=0.05)
