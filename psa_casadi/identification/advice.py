@@ -33,14 +33,14 @@ STEP_SAMPLES, MULTISINE_SAMPLES, LOOP_SAMPLES, HOLD_SAMPLES = 2000, 3000, 400, 2
 _BAND = 0.2
 #: Sampling intervals that are tried, at most.
 _RUNGS = 6
-#: Samples within the shortest lag at the fastest rate worth trying.
+#: Samples within the shortest lag at the fastest rate that is tried.
 _FINEST = 5.0
 #: A loop this much slower than the stack's settling is quasi-static.
 _QUASI_STATIC = 0.05
 _CYCLES = 6
 #: Parameters that stand for a lag.
 _LAGS = ("tau", "R_s", "c_P", "c_B", "c")
-#: Longest loops worth advising have this frequency [Hz].
+#: Longest loops that are advised have this frequency [Hz].
 _SLOWEST = 1e-3
 _LONGEST_HOLD = 7200.0
 
@@ -147,7 +147,7 @@ def _loops(frequency: float, settling: float, low: float, high: float) -> Iterat
 #: Parameters that only fast records determine; a fit leaves them at their start where it must.
 SEARCHABLE = ("tau", "R_s", "c_P", "c_B", "c", "m_P", "m_B", "m")
 #: Weights by which the open lags share their sum, and the damping ratio of open masses. No two
-#: lags are equal: two equal poles cannot be told apart by any record.
+#: lags are equal: no record separates two equal poles.
 _CASES: tuple[tuple[Mapping[str, float], float], ...] = (
     ({"tau": 10.0, "R_s": 2.0, "c_P": 1.0, "c_B": 4.0, "c": 4.0}, 2.0),
     ({"tau": 2.0, "R_s": 4.0, "c_P": 1.0, "c_B": 10.0, "c": 10.0}, 0.3),
@@ -180,7 +180,7 @@ def scenarios(model: Model, open_names: Collection[str]) -> list[Model]:
 
 
 def _lag(values: Mapping[str, float], name: str) -> float:
-    """Return the lag [s] that a parameter stands for."""
+    """Return the lag [s] of a parameter."""
     if name == "tau":
         return values["tau"]
     if name == "R_s":
@@ -205,7 +205,7 @@ class Advice(Worded):
     `single` does so by itself, as well as those `instead` of it, `together` with what is advised
     before it. `plan` is None where the advice is none to measure a record: masses that show if the
     mechanics ring (`ringing`), parameters that none of the plans `tried` determines (`nothing`),
-    and the scale of `force`, which no record tells.
+    and the scale of `force`, which no record determines.
     """
 
     kind: Literal["single", "together", "ringing", "nothing", "force"]

@@ -1,4 +1,4 @@
-"""What stands behind a fitted model, to be kept with it: ranges, covariance, runs to play again."""
+"""The evidence of a fitted model: ranges of its inputs, covariance, runs to simulate again."""
 
 from collections.abc import Sequence
 
@@ -27,7 +27,7 @@ from psa_casadi.variables import Interval
 _LONGEST, _MISSED = 300, 2e-3
 #: Digits of a reference run's samples, of their largest value.
 _DIGITS = 7
-#: Differences of neighbouring samples are noise up to so many of its standard deviations.
+#: Differences of neighbouring samples are noise up to this many of its standard deviations.
 _NOISE = 6.0 * np.sqrt(2.0)
 
 
@@ -40,10 +40,10 @@ def evidence_of(
     by: str,
     sampled: Sequence[Record] = (),
 ) -> Evidence:
-    """Return the evidence of a fit: what was seen, how sure the values are, runs to play again.
+    """Return the evidence of a fit: ranges of the inputs, covariance, runs to simulate again.
 
     `predicted` [m] are the records in full, in the order of `experiments`; `sampled` the records
-    as they were given, where samples of them were averaged. Held-out samples have the error of the
+    before block averages, if there are any. Held-out samples have the error of the
     runs; its interval and the budget are the diagnosis's to add.
     """
     model, records = fit.model, [e.record for e in experiments]

@@ -143,7 +143,7 @@ def other_hold(experiments: Sequence[Experiment]) -> Hold:
 
 
 def refitted(of: Fit, others: Sequence[Experiment]) -> Fit:
-    """Fit other experiments of as many records from where a fit stands, or from its values alone.
+    """Fit other experiments of as many records from the end of a fit, or from its values alone.
 
     Raises SimulationError.
     """
@@ -177,7 +177,7 @@ _SURE, _NEAR = 6.0, 0.25
 _ROUNDING = 1e-6
 
 
-#: A fit's records read otherwise, and what is to be said of that.
+#: A fit's records in another reading, and a note on it.
 Otherwise = tuple[tuple[Experiment, ...], Note]
 
 
@@ -277,7 +277,7 @@ def _shown(fit: Fit, number: int, record: Record) -> FloatArray:
 
 
 def _evened(record: Record) -> Record:
-    """Return a record with the even times nearest to its own; itself where they are not near."""
+    """Return a record with the nearest even times; the record itself if they are not near."""
     places = np.arange(record.n)
     step, first = np.polyfit(places, record.time, 1)
     even = first + step * places

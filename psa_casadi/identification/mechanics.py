@@ -1,17 +1,17 @@
-"""Mechanics fitted again: factors of the linear part exchanged, and from the fit's own force.
+"""Mechanics fitted again: factors of the linear part exchanged, and from the fit's force.
 
 The linear part is a product, eqs. (13), (15), so that two of its factors can change places with
-little effect: the two oscillators differ in the zero alone; the drive's lag stands before the
+little effect: the two oscillators differ in the zero alone; the drive's lag is before the
 hysteresis and the creep lag after it, which shows only where the voltage turns; an overdamped
 oscillator has a slow pole that looks like a lag. A search from one start may end on the wrong side.
 
-Beside a fast oscillator, that slow pole of lag c/k brings a zero of lag c/k k_P/(k_P + k_B), or
+With a fast oscillator, that slow pole of lag c/k brings a zero of lag c/k k_P/(k_P + k_B), or
 c/k k_B/(k_P + k_B). Where the creep lag cancels the zero, the pole alone is left: it may be the
 creep lag, and the oscillator as fast as the other one.
 
 Two resonances within the band, a lag and the zero between them give a fit many local minima, most
 of them far above the noise. There the force is nearly right: what it has of the voltage's history
-is quasi-static and hardly depends on the mechanics. So the fit's own force, simulated, takes the
+is quasi-static and hardly depends on the mechanics. So the fit's force, simulated, takes the
 voltage's place in `linear_start`: poles by vector fitting, placed, refined with the ratio k_P/k_B
 free, and a full fit from each of the best. The play operators of `starting_points` then stand for
 what is wrong with that force. A better fit has a better force.
@@ -79,7 +79,7 @@ def exchanges(p: Values) -> Iterator[tuple[str, dict[str, float]]]:
             yield f"drive lag and {what}", slowed | {"R_s": lag / p["C_p"]}
 
 
-#: Parameters that only fast records determine: each is freed when the data can tell it.
+#: Parameters that only fast records determine: each is freed if the data determine it.
 FAST = ("m_P", "m_B", "m", "k_P")
 #: Without this relative standard error k_P stays where it is: it would only blur every force.
 _SHARP = 0.1
@@ -89,7 +89,7 @@ _FIRST, _LAST, _ROUNDS, _HOPEFUL = 5, 30, 3, 2.0
 
 
 def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Free the fast parameters that these records can tell, if that lowers the cost clearly."""
+    """Free the fast parameters that these records determine, if that lowers the cost clearly."""
     free = best.unknowns.names
     available = [n for n in FAST if n in best.model.values and n not in (*free, "k_P")]
     more = [n for n in available if _would_determine(best, experiments, n)]
@@ -106,7 +106,7 @@ def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) 
 
 
 def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
-    """Fix k_P where it is if the records tell it badly: forces then keep their proportions."""
+    """Fix k_P where it is if its standard error is large: forces then keep their proportions."""
     names = best.unknowns.names
     if "k_P" not in names:
         return best
@@ -122,7 +122,7 @@ def exchanged(
 ) -> tuple[Fit, tuple[str, ...]]:
     """Fit again with factors of the linear part exchanged; return the best, and what stays open.
 
-    See `exchanges`. Parameters of an exchange that fits as well are not told by the records. After
+    See `exchanges`. The records do not determine parameters of an exchange that fits as well. After
     an exchange that fits better, the others are tried once more.
     """
     for _ in range(_ROUNDS):
@@ -197,7 +197,7 @@ def force_of(fit: Fit, number: int, record: Record) -> FloatArray:
 
 #: Samples that one record and all together may have, and the fewest that count.
 _MOST, _ALL, _FEWEST = 6_000, 12_000, 16
-#: Share of them that is given to the transient: from the record's start, and from amid it.
+#: Share of them that is left out as the transient: from the record's start, and from amid it.
 _LEAD, _AMID = 0.01, 0.2
 #: Records sampled this much more slowly than the fastest add no dynamics.
 _SLOWER = 30.0
@@ -205,7 +205,7 @@ _SLOWER = 30.0
 _ORDERS = (2, 3, 4, 5, 6)
 #: How many starts get a few evaluations, how many of these a full refinement.
 _REFINEMENTS = ((12, 6), (4, 25))
-#: How many full fits are begun, with how many evaluations, how many of them are ended, and rounds.
+#: How many full fits are started, with how many evaluations, how many are ended, and rounds.
 _BEGUN, _QUICK, _ENDED, _REPEATS = 3, 15, 2, 4
 #: The fit misses something where its rms is this much above the noise; a better one lowers the
 #: cost, twice the log-likelihood, by more than this.
@@ -221,7 +221,7 @@ def retuned(
 ) -> Fit:
     """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
 
-    It is sought while records miss more than their own fast part, which holds some of a misfit's
+    It is sought while residuals of records exceed their fast part, which has some of a misfit's
     ringing, or than the rms [m] that another model has `reached`. Needs two resonators (k_P, k_B);
     records on instants that are not uniform do not contribute. A keyboard interrupt ends it at the
     best fit so far.

@@ -26,12 +26,12 @@ from psa_casadi.variables import Parameter
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2
-#: Starts whose costs differ by less than this share have found the same minimum.
+#: Starts whose costs differ by less than this share have the same minimum.
 _SAME = 0.01
-#: Starts lie within so many natural logarithms, or ordinary changes, of the declared value.
+#: Starts lie within this many natural logarithms, or ordinary changes, of the declared value.
 _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
-#: Samples at least from which a rate is told.
+#: Fewest samples for a rate.
 _SLOPE = 8
 
 

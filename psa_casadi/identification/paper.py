@@ -1,4 +1,4 @@
-"""The paper's own identification, section 3: moments of a step, zero crossings of loops.
+"""The paper's identification, section 3: moments of a step, zero crossings of loops.
 
 Source: Yang and Zhu 2015. The linear part comes from the response to a step, eqs. (15) to (21); the
 hysteresis, eqs. (25) to (35), from loops below 1 Hz: zero crossings, then logarithmic least
@@ -35,9 +35,9 @@ from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
 _LEVEL, _RISE = 0.05, 0.05
-#: A turning point stands out by this share of the voltage's range; turns come at even intervals.
+#: The prominence of a turning point over the voltage's range; turns come at even intervals.
 _PROMINENCE, _EVEN = 0.05, 1.2
-#: The mean over this last share of a step response stands for its steady state.
+#: The mean over this last share of a step response is taken for its steady state.
 STEADY_SHARE = 0.05
 #: At the start of a loop the voltage counts as its first value within this share of its range.
 _AT_REST = 1e-3
@@ -158,7 +158,7 @@ _OVERSHOOT = 0.01
 def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
     """Return a_1..a_5 [s to s^5], b_1 [s], eq. (15), of one step response, and their doubts.
 
-    They are found by its iterated integrals.
+    They follow from its iterated integrals.
     """
     values = moment_coefficients(step.time, step.g)
     kept = step.time <= (1.0 - _CUT) * step.time[-1]
@@ -176,11 +176,11 @@ def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
 
 
 def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
-    """Return a_1..a_5, b_1, shape (6,), of a normalised step response that begins at time 0.
+    """Return a_1..a_5, b_1, shape (6,), of a normalised step response that starts at time 0.
 
     `time` (n,) [s], `g` (n,) [1]; exact only if g is free of noise and the window is endless. By
     K_1..K_6, eqs. (16), (19), with the trapezoidal rule: g_1' = 1 - g,  g_i' = K_(i-1) - g_(i-1),
-    K_i = lim g_i, for which the last sample stands.
+    K_i = lim g_i, for which the last sample is taken.
     """
     width = np.diff(time)
     limit, current, limits = 1.0, g, []
@@ -193,10 +193,10 @@ def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def coefficients_of_limits(limits: FloatArray) -> FloatArray:
-    """Solve eq. (21) for a_1..a_5, b_1, shape (6,), given K_1..K_6.
+    """Solve eq. (21) for a_1..a_5, b_1, shape (6,), from K_1..K_6.
 
     K_1 = a_1 - b_1,  K_i = sum_(j=1..5) (-1)^(j-1) K_(i-j) a_j with K_0 = 1 and K_m = 0 for m < 0.
-    Times are counted in units of |K_1| while solving, which keeps the six equations alike in size.
+    Times are counted in units of |K_1| while solving, so that the six equations have similar sizes.
     """
     unit = abs(float(limits[0])) or 1.0
     k = np.concatenate([[1.0], limits / unit ** np.arange(1, 7)])
@@ -233,7 +233,7 @@ def _reasons(step: Step) -> list[tuple[str, float]]:
 _FACTORS = ("tau", "m_P", "c_P", "m_B", "c_B")
 #: A root counts as real where its imaginary part is below this share of its size.
 _REAL = 1e-6
-#: The zero that the factors imply may differ from b_1 by this share before a sentence says so.
+#: The zero that the factors imply may differ from b_1 by this share without a note.
 _ZERO_AGREES = 0.2
 
 
@@ -244,7 +244,7 @@ def mechanics_of(
 
     a_5 s^5 + ... + a_1 s + 1 = (tau s + 1) (m_P/k_P s^2 + c_P/k_P s + 1) (m_B/k_B s^2 + ...).
     A real root gives tau, the other four make two pairs. Where several readings exist (the
-    displacement does not tell them apart, but for the zero) the one is taken whose zero,
+    displacement does not separate them, but for the zero) the one is taken whose zero,
     (c_B + c_P)/(k_B + k_P), comes nearest to b_1, and of those the one with the longest tau. Where
     a pole does not decay, tau = K_1 = a_1 - b_1, the first line of (21), is all that is left.
     """
@@ -299,7 +299,7 @@ _ORDER, _SHORTEST = 3, 5
 #: The window grows until the noise of x' is below this share of the mean speed of the loop,
 #: and to this share of a period at most.
 _QUIET, _LONGEST = 2e-3, 0.1
-#: The noise of x' over what is allowed, beyond which a sentence says so.
+#: The noise of x' over what is allowed, beyond which there is a note.
 _TOO_MUCH = 2.0
 
 
@@ -322,8 +322,8 @@ def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
 
     The window is the shortest odd one with s |c| <= 0.002 * 2 f range(x), where s is the white
     noise of the displacement, c the filter's coefficients, f the loop's frequency; it is a tenth
-    of a period at most, and a sentence says where that is not enough. Voltage and displacement
-    pass through the same filter, so that what it bends it bends alike.
+    of a period at most, with a note if that is not enough. Voltage and displacement pass through
+    the same filter, which distorts both equally.
     """
     period = 1.0 / (loop.frequency * loop.sample_time)
     longest = max(_SHORTEST, int(_LONGEST * period) // 2 * 2 - 1)
@@ -357,7 +357,7 @@ def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
 _CLEAR = 0.1
 #: A crossing counts above this share of the largest voltage.
 _NEAR_REST = 0.05
-#: More logarithms of negative numbers than this share are worth a sentence.
+#: More logarithms of negative numbers than this share have a note.
 _FEW = 0.1
 #: Scatter of A_i over the periods, and h at the loop's top, that make k doubtful.
 _SCATTER, _CLOSED = 0.1, 0.3
@@ -373,7 +373,7 @@ class Bends(NamedTuple):
 
 @dataclass(frozen=True)
 class HysteresisPart:
-    """What the loops tell; None where they tell nothing. A alone stands when n, beta, gamma fail.
+    """The hysteresis from the loops; None without any. A remains alone if n, beta, gamma fail.
 
     `A` [m/V] and `delta` [m/(V.s)] are those of eq. (30), `bends` n, beta and gamma (35).
     """
@@ -395,10 +395,10 @@ class _Line(NamedTuple):
 
 
 def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
-    """Return A, delta by eqs. (28) to (30), n, beta, gamma by (31) to (35), given k [m/V].
+    """Return A, delta by eqs. (28) to (30), n, beta, gamma by (31) to (35), at k [m/V].
 
     (34) takes the logarithm of (gamma - beta) h^n. A loop that lags has beta > gamma; then the
-    logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
+    logarithm of (beta - gamma) h^n is taken, which is equivalent, with a note.
     """
     differentiated = [rates_of(loop, k) for loop in loops]
     rates = [r for r, _ in differentiated]
@@ -545,9 +545,9 @@ def in_forces(
     coefficients: Mapping[str, float] | None,
     bend: HysteresisPart,
 ) -> tuple[Model, tuple[str, ...], list[Note]]:
-    """Return `start` with everything that was found, k_P and k_B being those of `start`.
+    """Return `start` with all that is identified, k_P and k_B being those of `start`.
 
-    Beside it the names of the parameters that were found, and what could not be taken over.
+    With it the names of the identified parameters, and notes on values out of their bounds.
     k_L = k/C with C = 1/k_P + 1/k_B [m/N]; lag, masses and dampings are factors of the denominator.
     Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
     since nothing is known to ring. A value out of its bounds is refused, n is clipped.
@@ -584,7 +584,7 @@ def in_forces(
     return usual.with_values(kept), names, notes
 
 
-#: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
+#: The part of the rising branch, over the largest voltage, whose slope replaces a step's.
 _TIP = (0.8, 0.97)
 
 
@@ -638,7 +638,7 @@ def identify_by_paper(
     """Return the paper's identification with its residuals on all records, as `identify` does.
 
     Nothing is fitted but each record's memory and offset; so there are no intervals. The warnings
-    are the method's own sentences. Raises InputError, SimulationError.
+    are the method's sentences. Raises InputError, SimulationError.
     """
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
@@ -670,7 +670,7 @@ def identify_by_paper(
 def _slope_at_tip(loops: Sequence[Loop]) -> float | None:
     """Return dx/du near the tip of the widest loop's rising branches [m/V], None without loops.
 
-    Where eq. (8) is saturated, h' = 0 and x' = k u'; so it stands in for the slope of a step.
+    Where eq. (8) is saturated, h' = 0 and x' = k u'; so it replaces the slope of a step.
     """
     if not loops:
         return None

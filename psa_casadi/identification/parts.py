@@ -1,13 +1,13 @@
 """Multiple shooting: records in parts where one simulation of the whole cannot be followed.
 
 What a model misses grows with time where it is unstable or chaotic, and stays where it integrates:
-no fit comes near the data from ordinary starts, and what is missing shows as a drift of its own.
-Each part begins with a state of its own, which is estimated with the parameters (Bock, Recent
+no fit comes near the data from ordinary starts, and what is missing shows as a drift.
+Each part starts with a free state, which is estimated with the parameters (Bock, Recent
 advances in parameter identification techniques for ODE, 1983). Short parts are fitted from several
 starts; then two become one, with the state that the first began with, as long as the model follows
 them. Where it follows the whole records so, they are whole again, from a better start.
 
-An FMU that is run as a whole begins in one state only: of it, records are fitted from their
+An FMU that is run as a whole starts in one state only: of it, records are fitted from their
 beginning on, a part first, and then twice as much. Where the declared values lead to a fit that
 follows the records, no others are tried, as each run is dear.
 """
@@ -22,7 +22,7 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.inputs import read_like, read_otherwise
 from psa_casadi.identification.multistart import levelled, search_starts
 from psa_casadi.identification.refitting import POLISH, weighted
-from psa_casadi.identification.result import MISSED, StartOutcome
+from psa_casadi.identification.result import EXCESSIVE, StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
@@ -36,20 +36,20 @@ from psa_casadi.units import FloatArray
 #: A model follows an output where it misses less than this share of its standard deviation; one
 #: that forgets its start is not lost where it comes so near; beyond the last it shows nothing.
 _FOLLOWED, NEAR, _LOST = 0.05, 0.5, 0.7
-#: Samples of a part at least, and parts at most; of what begins once, the first over the whole.
+#: Samples of a part at least, and parts at most; most of a model that starts in one state only.
 _FEWEST, _MOST, _LEAST = 16, 128, 32
 #: Lengths of short parts that are tried, over the shortest.
 _SHORT = (4, 2, 1)
 #: A model forgets where its outputs depend on the first states less than this at the end, over how
 #: they do at the beginning; so large a share of a part is its beginning, and its end.
 _FORGOTTEN, _END = 0.1, 0.1
-#: An error at the beginning of a part grows to so many times its size in it, at most.
+#: Largest growth of an error from the beginning of a part within it.
 _GROWTH = 1000.0
 
-#: The experiments of records in parts of so many samples, or whole.
+#: The experiments of records in parts of a number of samples, or whole (None).
 Made = Callable[[int | None], tuple[Experiment, ...]]
-#: A fit, its experiments, what became of every start, and what is to be said.
-Found = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
+#: A fit, its experiments, the outcome of every start, and notes.
+Fitted = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
 
 
 def ways(
@@ -61,7 +61,7 @@ def ways(
     undecided: bool,
     starts: int,
     progress: Progress = silent,
-) -> Iterator[Found]:
+) -> Iterator[Fitted]:
     """Yield the best fit of whole records, and that of parts where these may be better.
 
     `made` turns the records that were `signals` into experiments, `cut` into parts or not. Where it
@@ -113,7 +113,7 @@ def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED
     for o in of.channels:
         measured = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
         noise = np.repeat([first_order_noise(p)[0] if p.size else 0.0 for p in o.parts], o.lengths)
-        least = MISSED * float(np.sqrt(np.mean(noise**2)))
+        least = EXCESSIVE * float(np.sqrt(np.mean(noise**2)))
         if o.rms > max(share * float(np.std(measured)), least):
             return False
     return True
@@ -122,11 +122,11 @@ def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED
 def _in_parts(
     model: Model, signals: Sequence[Signals], made: Made, free: Sequence[str], undecided: bool,
     starts: int, progress: Progress,
-) -> Found | None:  # fmt: skip
+) -> Fitted | None:  # fmt: skip
     """Return the fit of the longest parts that a model follows, or of whole records.
 
-    None where it follows none, and where it forgets how records began: what it misses is told as
-    well of whole ones.
+    None where it follows none, and where it forgets how records started: whole ones then
+    serve as well.
     """
     shortest = _shortest(model, signals, made, free, starts, progress)
     if shortest is None:
@@ -194,9 +194,9 @@ def begins_once(model: Model) -> bool:
 
 
 def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Signals]:
-    """Return records in parts of so many samples, the last one of up to half of them more.
+    """Return records in parts of `length` samples, the last one of up to half of them more.
 
-    Only the first part of each for a model that begins once.
+    Only the first part of each for a model that starts in one state only.
     """
     if length is None:
         return list(signals)
@@ -210,7 +210,7 @@ def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Si
 
 
 def fit_longer_parts(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
-    """Fit longer parts from where a fit of shorter ones stands. Raises SimulationError."""
+    """Fit longer parts from the end of a fit of shorter ones. Raises SimulationError."""
     known = {_place(e): start for e, start in zip(parts, of.starts(), strict=True)}
     starts: list[Mapping[str, float]] = [known.get(_place(e), {}) for e in longer]
     sigma = [of.sigma[0]] * len(longer)

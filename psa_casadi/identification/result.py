@@ -23,8 +23,8 @@ from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import Interval, Provenance
 from psa_casadi.version import __version__
 
-#: A residual above so many times its own fast noise shows that the model misses something.
-MISSED = 1.5
+#: A residual above this multiple of its fast noise shows that the model lacks something.
+EXCESSIVE = 1.5
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class StartOutcome:
 class Identification(Reported):
     """An identified model with the fit behind it, what the data determine, and doubts.
 
-    `starts` tells what became of every start of the search; `notes` what was done to the records
+    `starts` are the outcomes of all starts of the search; `notes` what was done to the records
     (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
-    `interrupted` says that a keyboard interrupt ended the search, or what came after it.
+    `interrupted`: a keyboard interrupt ended the search, or what came after it.
     `noise_kinds` are those of every output of every record; `notes` say what to do about them.
     """
 
@@ -73,7 +73,7 @@ class Identification(Reported):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was done to the records and found in them, in words."""
+        """What was done to the records, and their noise, in words."""
         return texts(self.notes)
 
     @property
@@ -168,7 +168,7 @@ def with_origin(
     intervals: Mapping[str, Interval],
     **more: Any,
 ) -> Model:
-    """Return a fitted model that says from which records it comes and how sure its values are.
+    """Return a fitted model with its records and the intervals of its values as its provenance.
 
     `more` are other fields of `Provenance` by name.
     """

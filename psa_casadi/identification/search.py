@@ -4,7 +4,7 @@ The noise of an input moves the model, so that a fit prefers whatever explains t
 without that input. A load that is a function of the displacement is known better by its curve over
 the displacement that a model without it predicts from the voltage: an instrument whose error has
 nothing to do with the load cell's (instrumental variables; Fuller, Measurement Error Models 1987).
-A straight line is what a stiffer stack does: it tells nothing of the stiffness that it meets.
+A straight line is what a stiffer stack does: it does not determine the stiffness that it meets.
 Where the displacement's sensor bends, that model is bent with it, and the load may be a straighter
 curve over what the same model predicts that is fitted to the load itself.
 """
@@ -57,7 +57,7 @@ CORE = (
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5
 #: The second best is followed to the end where its cost is at most this much larger.
 _NEAR = 1.5
-#: A fit misses the records where its mean weighted square exceeds this; so many starts are then
+#: A fit lacks something if its mean weighted square exceeds this; this many starts are then
 #: followed to the end.
 _MISSED, _FOLLOWED = 2.0, 4
 #: A start whose quick fit comes this close to the best one's cost is followed to the end.
@@ -74,9 +74,9 @@ class Search:
 
 
 def free_parameters(model: Model, records: Sequence[Record] = ()) -> list[str]:
-    """Return the core parameters and those of the model's effects that records can tell.
+    """Return the core parameters and those of the model's effects that records determine.
 
-    A measured load that changes tells the stiffness that it meets.
+    A measured load that changes determines the stiffness that it meets.
     """
     effects = [n for c in model.effects for n in c.fitted]
     loaded = "load_force" in model.input_names and any(
@@ -102,7 +102,7 @@ def search(
     thorough: bool = False,
     progress: Progress = silent,
 ) -> Search:
-    """Fit the core parameters from several starts, then whatever else the data can tell.
+    """Fit the core parameters from several starts, then whatever else the data determine.
 
     The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
     (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
@@ -130,7 +130,7 @@ def _search(
     progress: Progress,
     keep: Callable[[Fit], None],
 ) -> Search:
-    """Search as `search` says; `keep` gets every fit that is better than those before it."""
+    """Search as `search` does; `keep` gets every fit that is better than those before it."""
     records = [e.record for e in fitted(experiments)]
     core = free_parameters(model, records)
     mechanics = resolved(model, linear, min(r.sample_time for r in records))
@@ -281,8 +281,8 @@ def search_forms(
 
 #: The column, and the highest order of the curve.
 LOAD, _ORDER = "load_force", 8
-#: The curve stands for the load where it misses no more than its noise, with this margin, and this
-#: share of its range.
+#: The curve replaces the load if the rms difference is no more than the noise, with this margin,
+#: and this share of the range.
 _NOISE, _SHARE = 1.1, 1e-3
 
 
@@ -306,7 +306,7 @@ def loads_as_curves(
     """Return the experiments with loads that are curves over the displacement as these curves.
 
     Of a fit without the load, from `start`. Where all of them are straight lines they are 0: the
-    model's stiffness stands for them. Other loads stay as they were measured. Without a load that
+    model's stiffness replaces them. Other loads stay as they were measured. Without a load that
     changes nothing is fitted.
     """
     loads = [np.asarray(e.record.load_force, dtype=float) for e in experiments]
@@ -336,7 +336,7 @@ def loads_as_curves(
 
 
 def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, int] | None:
-    """Return the polynomial that stands for a load (n,) [N], and its order; None if all are far.
+    """Return the polynomial that replaces a load (n,) [N], and its order; None if all are far.
 
     Over one of the displacements x (n,) [m]; of the smallest n ln S + order ln n (Schwarz 1978).
     """

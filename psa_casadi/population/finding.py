@@ -66,7 +66,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Trace:
-    """The first part of a record beside its model: (n,) in SI units, nan where not measured."""
+    """The first part of a record and its model: (n,) in SI units, nan where not measured."""
 
     record: str
     time: tuple[float, ...]
@@ -106,7 +106,7 @@ class Finding:
 
 
 def replayed(model: Model) -> Trace | None:
-    """Return the first part of the record beside the model with the sensor's offset, else None.
+    """Return the first part of the record and the model with the sensor's offset, else None.
 
     Raises SimulationError.
     """

@@ -1,4 +1,4 @@
-"""A population of devices: what is common, what spreads, who stands out, batches and drift.
+"""A population of devices: common values, their spread, outliers, batches and drift.
 
 Parameters that differ between two or more findings by more than their noise.
 
@@ -87,7 +87,7 @@ def _is_determined(p: Estimate) -> bool:
 
 @cache
 def _declared() -> tuple[frozenset[str], dict[str, str]]:
-    """Return the parameters that are fitted on a logarithmic scale, and units that are shown."""
+    """Return the parameters that are fitted on a logarithmic scale, and units of display."""
     every = [p for c in (*COMPONENTS.values(), *EFFECTS.values()) for p in c.parameters]
     return (
         frozenset(p.name for p in every if p.log),
@@ -96,7 +96,7 @@ def _declared() -> tuple[frozenset[str], dict[str, str]]:
 
 
 def display_unit(name: str, unit: str) -> str:
-    """Return the unit that a parameter is shown in."""
+    """Return the unit in which a parameter is displayed."""
     return _declared()[1].get(name, unit)
 
 
@@ -131,7 +131,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Frequency:
-    """How often something was found: count, of how many, and Wilson's 95 % interval."""
+    """How often a verdict or a cause occurs: count, of how many, and Wilson's 95 % interval."""
 
     what: str
     count: int
@@ -144,7 +144,7 @@ class Population:
     """What a population shows.
 
     `outliers`, `batch_p` and `drift_p` are adjusted over all parameters (and devices); the latter
-    two are by parameter. `left_out` says which parameters too few devices tell.
+    two are by parameter. `left_out` are the parameters that too few devices determine.
     """
 
     findings: tuple[Finding, ...]
@@ -174,7 +174,7 @@ def population(findings: Sequence[Finding]) -> Population:
     over all tests of one kind.
 
     Raises:
-        InputError: no parameter is told by more than three devices.
+        InputError: no parameter is determined by more than three devices.
     """
     every = [estimates(findings, name) for name in names_of(findings)]
     spreads = [_spread(findings, e) for e in every if len(e.places) > FEWEST]
@@ -248,7 +248,7 @@ def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency,
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """A parameter that two findings or more tell; p values of "all have one value"."""
+    """A parameter that two findings or more determine; p values of "all have one value"."""
 
     estimates: Estimates
     p_value: float
@@ -261,7 +261,7 @@ class Difference:
 
 
 def differences(findings: Sequence[Finding]) -> tuple[Difference, ...]:
-    """Return the parameters that two findings or more tell, in the order of the files."""
+    """Return the parameters that two findings or more determine, in the order of the files."""
     shared = [e for n in names_of(findings) if len((e := estimates(findings, n)).places) > 1]
     p_values = [mixed_regression(e.theta, e.errors).p_value for e in shared]
     corrected = adjusted(p_values, "bonferroni")

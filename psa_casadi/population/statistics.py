@@ -5,7 +5,7 @@ Regression over devices that differ by more than the noise of each: random effec
     theta_i = X_i b + u_i + e_i,    u_i ~ N(0, tau^2),    e_i ~ N(0, s_i^2)
 
 The estimates theta_i come with known standard errors s_i; tau is the spread of the devices
-themselves. For a given tau, b is the weighted least squares with w_i = 1/(s_i^2 + tau^2), and
+themselves. At a tau, b is the weighted least squares with w_i = 1/(s_i^2 + tau^2), and
 
     Q(tau^2) = sum_i w_i (theta_i - X_i b)^2  ~  chi^2(n - p).
 
@@ -28,10 +28,10 @@ them, its estimate is
 
 with Student's t of n - 2 degrees of freedom as the distribution of z, since tau is estimated
 (W. Viechtbauer and M. W.-L. Cheung, Res. Synth. Methods 1 (2010) 112: studentized deleted
-residuals). A device far out widens tau and hides others, so those already found are left out of the
-others' mean and spread, and all are tested again, until no more are found (forward search).
+residuals). A device far out widens tau and hides others, so outliers are left out of the others'
+mean and spread, and all are tested again, until there are no more (forward search).
 
-Batches that differ, and drift over the date, told from the spread of devices and their noise.
+Batches that differ, and drift over the date, beyond the spread of devices and their noise.
 
 Batches: theta_ij = mu_j + u_ij + e_ij with one spread tau within all batches (`mixed_regression`
 with a column for each). That all mu_j are equal is tested by
@@ -56,7 +56,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.units import BoolArray, FloatArray
 
 Adjustment = Literal["benjamini-hochberg", "bonferroni"]
-#: What an adjusted p value must be below to be told.
+#: Adjusted p values below this are significant.
 LIMIT = 0.05
 
 
@@ -64,7 +64,7 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
     """Return adjusted p values, shape (n,) as `p`.
 
     `bonferroni` (Holm's step-down form) bounds the chance of one false alarm or more.
-    `benjamini-hochberg` bounds the expected share of false ones among those told; where nothing is
+    `benjamini-hochberg` bounds the expected share of false ones among the significant; where nothing is
     true both bounds are the same.
 
     Sources: S. Holm, Scand. J. Statist. 6 (1979) 65; Y. Benjamini and Y. Hochberg, J. R. Statist.
@@ -84,7 +84,7 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
 
 #: What intervals are meant to hold.
 LEVEL = 0.95
-#: Newton's steps for tau^2 end when one is below this share of it, or after so many.
+#: Newton's steps for tau^2 end when one is below this share of it, and their largest number.
 PRECISION, MOST_STEPS = 1e-10, 200
 
 
@@ -177,7 +177,7 @@ def solve_tau2(y: FloatArray, s: FloatArray, x: FloatArray, wanted: float) -> fl
 def _weighted(
     y: FloatArray, s: FloatArray, x: FloatArray, tau2: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return b, its covariance and Q for a given tau^2."""
+    """Return b, its covariance and Q at a tau^2."""
     root = 1.0 / np.sqrt(s**2 + tau2)
     q, r = np.linalg.qr(x * root[:, None])
     inverse = np.linalg.inv(r)
@@ -186,7 +186,7 @@ def _weighted(
     return b, inverse @ inverse.T, float(rest @ rest)
 
 
-#: The others must be so many; rounds after which the search ends.
+#: Fewest others; rounds after which the search ends.
 FEWEST, _ROUNDS = 3, 20
 #: At most this share of the devices may be outliers: else they are a second kind.
 _MOST = 0.3

@@ -27,7 +27,7 @@ def sampler_and_arviz() -> tuple[Any, Any]:
     """Return the modules nutpie and arviz. Raises InputError where one is not installed."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # arviz tells of its next version
+            warnings.simplefilter("ignore", FutureWarning)  # arviz announces its next version
             return import_module("nutpie"), import_module("arviz")
     except ImportError as error:
         raise InputError(

@@ -97,7 +97,7 @@ class Density:
     """ln p(u | records), up to a constant, with its gradient, in whitened coordinates u.
 
     ln p = -sum_b (m_b / 2) ln |r_b|^2 - |r_p|^2 / 2 + ln |d theta / d z|, with the weighted
-    residuals r_b of every block and m_b the samples that they are worth: each block's noise level
+    residuals r_b of every block and m_b their effective number of samples: each block's noise level
     has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
     priors and a stack's further columns, whose levels are known. theta lies within its bounds
     (`Within`), and z = z_0 + L u, with the factor L of the covariance at the fit, so that u has
@@ -188,7 +188,7 @@ def task_of(
     """Fit the model from its values and set up the density around that fit.
 
     `free` are the parameters that are sampled (by default those that the model was fitted in, else
-    those that records of a stack can tell); `prior` are the values that the priors are centred at
+    those that records of a stack determine); `prior` are the values that the priors are centred at
     and `widths` their standard deviations, in ln units for parameters that span decades, else in
     ordinary changes. Raises InputError, SimulationError.
     """
@@ -216,7 +216,7 @@ def own_task_of(
     widths: Mapping[str, float] | None = None,
     **words: Any,
 ) -> Task:
-    """Identify a model of one's own and set up the density around that fit.
+    """Identify any model but a stack's and set up the density around that fit.
 
     The priors are centred at the declared values. `words` are those of `identify_ode`, the rest as
     in `task_of`.
@@ -250,7 +250,7 @@ def _around(
 ) -> Task:
     """Fit from the values, with priors about those of `centre`, and set up the density there.
 
-    Every record begins as in the fit `fit`, if there is one.
+    Every record starts as in the fit `fit`, if there is one.
     """
     names = tuple(values)
     unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
@@ -303,10 +303,10 @@ def _refuse(model: Model, names: Sequence[str], values: Mapping[str, float]) -> 
 def _centres(
     model: Model, records: Sequence[Record], names: Sequence[str], values: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return where the priors are centred: as given, else a stack of the records' size.
+    """Return where the priors are centred: at `values`, else a stack of the records' size.
 
     Never where a fit ended, which would count the records twice. What such a stack does not have
-    (effects) is centred at the declared value; a loop of the other sign at the model's own, as its
+    (effects) is centred at the declared value; a loop of the other sign at the model's, as its
     coordinates do not pass 0.
     """
     stiffness = next((model.values[n] for n in ("k_B", "k") if n in model.values), None)

@@ -1,15 +1,15 @@
 """Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives.
 
-Where records begin that are held out whole, of which no fit sees a sample.
+Initial states of records that are held out whole, of which the fit uses no sample.
 
-The stack begins as in the fitted records of the device that begin at the same voltage: what the
-first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
-simulated from it drifts off by a tenth of the range, where one that begins as the device's other
-records do stays within a hundredth. Where no fitted record begins alike, the first tenth finds the
-whole start. States of drive, sensor and environment belong to the record, and the first tenth finds
-them, too; but it hardly tells a charge that leaks slowly from the sensor's offset, and what it
-leaves open grows along the record. So such a state is looked for within the size that it has where
-the fitted records begin which begin alike (their root mean square is its prior).
+The stack starts as in the fitted records of the device with the same first voltage: memories that
+are estimated from the first tenth of a record mostly contain the model's error there. A loop that
+is simulated from these drifts by a tenth of the range; one that starts as the device's other
+records do stays within a hundredth. Without a fitted record of that first voltage, all of the start
+is estimated from the first tenth. States of drive, sensor and environment belong to the record and
+are estimated from its first tenth, too. That hardly separates a charge that leaks slowly from the
+sensor's offset, and the error grows along the record. So the prior of such a state has the root
+mean square that it has at the start of these fitted records.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -76,9 +76,8 @@ def held_out_starts(
 ) -> FloatArray:
     """Return theta with start and offset of the records that are held out whole; others stay.
 
-    `model` has the values of theta; `levels` are those of white noise which tells as little as what
-    the model misses, of the channels without factors. Raises PsaError where a record cannot be
-    simulated.
+    `model` has the values of theta; `levels` are the equivalent white-noise standard deviations of
+    the residuals of the channels without factors. Raises PsaError if a record cannot be simulated.
     """
     result = theta.copy()
     outside = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
@@ -177,7 +176,7 @@ def _fit_start(
 #: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
 #: then the stepper is taken.
 _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
-#: Multiple of the whole range that is missed (rms) where a loop has diverged. It would come down by
+#: Rms residual over the range at which a loop has diverged. It would come down by
 #: decades a step, each of which takes a hundred times as long as one of a loop that is stable.
 _DIVERGED = 1e6
 
@@ -196,7 +195,7 @@ def accurate_minimum(
     radius: float = FIRST_RADIUS,
     patient: bool = False,
 ) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, found by a simulation that is accurate there, and how that was done.
+    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's.
 
     See `minimise` for how far it is sought.
     """
@@ -334,11 +333,11 @@ class Fit:
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
-    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
+    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` holds how
     each record was run and how accurately; it is empty after an interrupt, and above the goal.
     `radius` is that of the next step. The residuals are those of the first `channel`, `lengths`
     (records,) of each record and `spread` the range of its readings; `further` are the fits of the
-    channels beside it. Of any model read displacement as its first channel, m as that one's unit.
+    other channels. Of any model read displacement as its first channel, m as that one's unit.
     """
 
     model: Model
@@ -377,9 +376,9 @@ class Fit:
     def data_cost(self) -> float:
         """The `cost` without its weak priors: the weighted sum of squares of the records alone.
 
-        Priors count from the model that a fit was given, so they add (ln ratio / spread)^2 to a
-        lag's fit that began elsewhere, 49 for a factor e^7, and nothing where it is begun again.
-        Fits of one search, which begin in different places, are compared by this.
+        Priors are centred at the model that a fit starts from, so they add (ln ratio / spread)^2
+        for a lag that started elsewhere, 49 for a factor e^7, and nothing after a restart there.
+        Fits of one search, which start from different values, are compared by this.
         """
         return self.cost - float(np.sum((self.theta / self.unknowns.prior) ** 2))
 
@@ -419,7 +418,7 @@ class Fit:
     ) -> list[Prediction]:
         """Predict whole records with their derivatives by theta, if `differentiated`.
 
-        The outputs of `further` channels come too if they are asked for.
+        With `further`, the outputs of the further channels as well.
         """
         return predict(
             self.model, experiments, self.unknowns, self.placed(experiments),
@@ -516,10 +515,10 @@ def fit(
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
-    Of the displacement and of the experiments' `further` columns, each by its own level.
+    Of the displacement and of the experiments' `further` columns, each weighted by its level.
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
-    those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
+    those of `unknowns_of(model, ...)`, the search starts at `start`, and may end early where the
     cost will stay above the `goal`; its first step is of the `radius`, and where it is `patient` it
     does not stop in a curved valley (`minimise`). Raises InputError when no sample can be used,
     SimulationError when the start cannot be simulated or its numbers overflow.
@@ -571,7 +570,7 @@ def unknowns_around(
     model: Model, free: Sequence[str], experiments: Sequence[Experiment], sigma: Sequence[float],
     *, placed: Model,
 ) -> Unknowns:  # fmt: skip
-    """Return the coordinates of a fit around a model's values, `placed` where it begins.
+    """Return the coordinates of a fit around a model's values; `placed` has the start's values.
 
     Of any model but a stack per experiment the initial states as deviations from the declared
     starts (unless these are known) over their usual sizes, with weak priors: `LINEAR_PRIOR` of

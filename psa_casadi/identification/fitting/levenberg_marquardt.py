@@ -16,7 +16,7 @@ from psa_casadi.units import FloatArray
 #: theta -> (residual (m,), Jacobian (m, k)), or None where the model cannot be evaluated.
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 
-#: Of a fit that begins, and at least of one that goes on.
+#: Radius of the first step of a fit, and the least one of a fit that continues.
 FIRST_RADIUS, LEAST_RADIUS = 1.0, 0.1
 _SMALLEST_RADIUS = 1e-6
 #: Where a step of any length promises more than this multiple of the tolerance, short steps are

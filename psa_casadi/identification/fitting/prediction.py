@@ -1,9 +1,9 @@
 """Predictions of a model for a set of experiments, their exact derivatives, and further channels.
 
-Channels beside the first are fitted as outputs: a stack's current, charge and so on. A channel may
-have an offset in each record and factors for what it shows, the same in all records; both are
-linear, so that they are projected out of the residual instead of being searched (variable
-projection; Golub and Pereyra 1973, with the Jacobian of Kaufman 1975).
+Further channels are fitted as outputs: a stack's current, charge and so on. A channel may have an
+offset in each record and factors of its outputs, the same in all records; both are linear, so that
+they are projected out of the residual instead of being searched (variable projection; Golub and
+Pereyra 1973, with the Jacobian of Kaufman 1975).
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,8 +39,8 @@ OUTPUT = "measured_displacement"
 class Prediction:
     """Predicted first channel (n,) of one record and its derivative (n, size) by theta.
 
-    `further` are the same of the further channels' outputs by name, where they were asked for, as
-    the model shows them. `way` tells how the record was integrated.
+    `further` are the same of the further channels' outputs of the model by name, if they were
+    requested. `way` is the name of the integration.
     """
 
     displacement: FloatArray
@@ -95,7 +95,7 @@ def trace_record(
 ) -> Traced:
     """Return outputs (n, m) and their derivatives by `wanted` and `start` (n, m, k + s).
 
-    By `wanted` (n, m, k) alone if those `by_start` are not asked for.
+    By `wanted` (n, m, k) alone without `by_start`.
     """
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
     begin = begun(model, t, u, start)
@@ -120,7 +120,7 @@ def trace_record(
 
 
 def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
-    """Return the states beside the memories whose start a record leaves open, with their size.
+    """Return the states, other than memories, whose start a record leaves open, with their size.
 
     A record starts where its first voltage and rate put the stack. That is wrong for one that
     starts amid motion which changes within the stack's settling time T by more than the noise [m]:
@@ -169,7 +169,7 @@ def predict(
     """Predict every experiment at theta, up to its last used sample, or in full (`everything`).
 
     Records are simulated side by side; `differentiated` or not, in which case the Jacobian has no
-    columns. The outputs of `further` channels come too if they are asked for.
+    columns. With `further`, the outputs of the further channels as well.
     """
     slopes, current = unknowns.slopes(theta), model.with_values(unknowns.values(theta))
     count = len(unknowns.names)
@@ -191,7 +191,7 @@ def predict(
             by_start, by_offset = unknowns.place_slopes(theta, index)
             by_theta = np.vstack([np.zeros((count, unknowns.size)), by_start])
             by_theta[:count, :count] = slopes
-            with np.errstate(all="ignore"):  # what is not finite is seen by the fit
+            with np.errstate(all="ignore"):  # the fit rejects what is not finite
                 flat = sensitivity.reshape(-1, len(by_theta)) @ by_theta  # one product for all
             sensitivity = flat.reshape(*traced.y.shape, unknowns.size)
         table = {n: (traced.y[:, k], sensitivity[:, k]) for k, n in enumerate(outputs)}
@@ -222,7 +222,7 @@ def simulated(
     *,
     way: Way,
 ) -> list[Simulated]:
-    """Tell how every record is run; a tenth of the tolerance and half the step show its error."""
+    """Return how every record is run, and its error: a finer run has a tenth of the tolerance."""
     current = model.with_values(unknowns.values(theta))
 
     def one(index: int) -> Simulated:
@@ -373,7 +373,7 @@ def span_of(experiments: Sequence[Experiment], number: int) -> float:
 
 
 def scaled(model: Model, furthers: Sequence[Further]) -> tuple[Model, tuple[Further, ...]]:
-    """Return a model whose sensors have the scales that were found, and the factors beside it."""
+    """Return a model whose sensors have the fitted scales, and the factors that remain."""
     values, others = {}, []
     for each in furthers:
         name, factors = each.channel.scale, each.factors

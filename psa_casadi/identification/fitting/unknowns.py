@@ -14,11 +14,12 @@ from psa_casadi.variables import State, nominal_value
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
 #: Initial states with a memory, in usual sizes. One that settles is a mean of its past, and so lies
-#: within its usual range: wider, it would stand for a relaxation of each record's own.
+#: within its usual range: a wider prior would let it fit a relaxation in each record.
 MEMORY_PRIOR, SETTLING_PRIOR = 3.0, 1.0
 #: Initial states other than memories, in what a steady motion at the record's rates would change.
 MOTION_PRIOR = 30.0
-#: Lags beside the creep lag are alike in most records: each stays near its start unless told.
+#: The responses to lags other than the creep lag are similar: each stays near its start unless the
+#: records determine it.
 LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
 _CARRIED = "f_H"
@@ -33,12 +34,12 @@ class Unknowns:
 
     theta = [parameters, then per record: initial states and the sensor's offset]. A parameter that
     spans decades is ln(value / reference), any other (value - reference) / scale. The loop's shape
-    (k_L, A, beta, gamma) has coordinates of its own where all four are free: with s = k_L + A, the
+    (k_L, A, beta, gamma) has joint coordinates where all four are free: with s = k_L + A, the
     slope just after a reversal, they are ln s, A_ref / A - 1, beta A / s and gamma A / s. A loop
     with weak bends fixes s and the two products, and hardly A itself; so its valley is straight
     here, and A without bound (Rayleigh's quadratic loop) lies at a finite distance.
     `started` names, per record, the states whose start is searched, as deviations from where the
-    record's first voltage and rate put them. Where the loop has its own coordinates, those of a
+    record's first voltage and rate put them. Where the loop has joint coordinates, those of a
     record's memory and offset are q_0 = f_H(0) / A and the offset plus C A (q_0 - v_0), with the
     first voltage v_0 and the static compliance C [m/N]: what follows keeps its place when A moves.
     `prior` holds the standard deviation of every coordinate's weak prior (infinite for offsets),
@@ -107,7 +108,7 @@ class Unknowns:
         return matrix
 
     def coordinates(self, values: Mapping[str, float]) -> FloatArray:
-        """Return the theta of the parameters (k,) at the given values.
+        """Return the theta of the parameters (k,) at these values.
 
         Raises PsaError for a loop that has no coordinates.
         """
@@ -238,7 +239,7 @@ def unknowns_of(
 ) -> Unknowns:
     """Set up the coordinates of a stack around a model's values.
 
-    `motions` names for every record the states beside the memories whose start is searched, each
+    `motions` names for every record the other states than memories whose start is searched, each
     with the size of an ordinary deviation, in the state's unit; `first_voltage` [V] is where each
     record starts.
     """

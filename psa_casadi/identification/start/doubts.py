@@ -89,8 +89,8 @@ def refuse_few(inputs: Sequence[Record], kept: Sequence[Record], texts: Sequence
 FASTEST = 2.0
 #: A mean speed [m/s] that few tests have: strokes of 10 um at 5 kHz.
 _FAST = 0.1
-#: Largest stroke that counts for that [m]: of more, the displacement's unit is wrong. Where the
-#: sensor's scale is unknown, a chip's stroke [m/V] stands for it.
+#: Largest stroke that counts for that [m]: of more, the displacement's unit is wrong. If the
+#: sensor's scale is unknown, a chip's stroke [m/V] is taken.
 _STROKE, _CHIP = 2e-3, 1e-8
 #: Time [s] for the whole range of the voltage that counts as held: see `hold_rate`.
 SLOWEST = 1000.0
@@ -165,7 +165,7 @@ def _paces(record: Record) -> tuple[float, float]:
 
 
 def _advice(pace: float, powers: Sequence[int]) -> str:
-    """Return which unit of time, so many powers of ten from the given, makes a pace usual."""
+    """Return which unit of time, by one of the powers of ten, makes a pace usual."""
     low, high = _USUAL
     power = next((p for p in powers if low <= pace / 10.0**p <= high), powers[-1])
     right, wrong = _UNITS[power]
@@ -186,14 +186,14 @@ _WRAPS = 2
 
 
 def refuse_wrapped(records: Sequence[Record]) -> None:
-    """Raise InputError where a displacement begins again at the end of the sensor's range."""
+    """Raise InputError if a displacement wraps round at the end of the sensor's range."""
     problems = [s for r in records if (s := _wrapped(r))]
     if problems:
         raise InputError(problems)
 
 
 def _wrapped(record: Record) -> str:
-    """Say that all large steps of a displacement are alike, and that it is right without them."""
+    """Return a sentence if a displacement without its large, equal steps follows the voltage."""
     y, v = _readings(record)
     steps = np.diff(y)
     large = np.abs(steps) > _STEP * np.ptp(y)
@@ -220,8 +220,8 @@ def _wrapped(record: Record) -> str:
 def doubtful_quantity(records: Sequence[Record]) -> str:
     """Say that a rate, an integral, or the sign turned below a voltage follows it better; else "".
 
-    A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
-    a record of which less than half is read: what it shows may follow the rate by itself.
+    A stack behind a lag that is long compared with the voltage's changes looks so too. "" for a
+    record of which less than half is read: that part may follow the rate by itself.
     """
     for record in records:
         y, v = _readings(record)

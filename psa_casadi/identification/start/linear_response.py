@@ -125,7 +125,7 @@ def plays(u: FloatArray, radii: npt.ArrayLike) -> FloatArray:
     """Return play operators (n, k) of the radii on u (n,), all of them centred at the first sample.
 
     p_i = min(max(p_{i-1}, u_i - r), u_i + r). A run of such steps clips between two levels, so the
-    levels of all blocks are found side by side, then the blocks are joined.
+    levels of all blocks are computed side by side, then the blocks are joined.
     """
     r = np.asarray(radii, dtype=np.float64)
     length = max(int(sqrt(u.size)), 1)
@@ -216,7 +216,7 @@ def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
 
 
 def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatArray:
-    """Return the largest root mean square of every pole's own part of a response, over its noise.
+    """Return the largest root mean square of every pole's part of a response, over its noise.
 
     Shape (order,); the two poles of a pair share one figure.
     """
@@ -227,9 +227,9 @@ def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatAr
         q, transform = orthonormal(matrix)
         weights = transform @ (q.T @ r.y[r.valid])
         for k in np.flatnonzero(poles.imag >= 0):
-            own = slice(k, k + (2 if poles[k].imag else 1))
-            part = columns[:, own] @ weights[own]
-            values[own] = np.maximum(values[own], np.std(part) / r.sigma)
+            pair = slice(k, k + (2 if poles[k].imag else 1))
+            part = columns[:, pair] @ weights[pair]
+            values[pair] = np.maximum(values[pair], np.std(part) / r.sigma)
     return values
 
 

@@ -1,6 +1,6 @@
 """Where a fit starts: a stack of the records' size, its capacitance, the form of its loop.
 
-The capacitance that a measured current or charge tells, without the mechanics.
+The capacitance from a measured current or charge, without the mechanics.
 
     C_p u' = i,   i = (G v - u) / R_s,   G = 1
 
@@ -47,7 +47,7 @@ FORMS = {"bouc-wen": BOUC_WEN, "spectrum": MEMORY_SPECTRUM}
 
 
 def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
-    """Return the model in each form that is to be fitted; as it is where none is asked for.
+    """Return the model in each form that is to be fitted; as it is if `hysteresis` is None.
 
     Raises InputError for a model whose hysteresis has neither form.
     """
@@ -101,7 +101,7 @@ class Capacitance:
         return abs(value - self.value) < _SAME * self.value
 
     def sentence(self, value: float) -> str:
-        """What the current says, in words; `value` [F] is that of the model."""
+        """The capacitance in words; `value` [F] is that of the model."""
         result = note(
             "capacitance", source=self.source, value=1e6 * self.value, low=1e6 * self.interval.low,
             high=1e6 * self.interval.high, share=100 * self.explained,
@@ -111,10 +111,10 @@ class Capacitance:
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
-    """Return what measured currents tell, else charges; None where neither follows a capacitance.
+    """Return the capacitance from measured currents, else charges; None if neither follows one.
 
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
-    explained badly. Records with uneven time steps tell nothing.
+    explained badly. Records with uneven time steps are left out.
     """
     even = [
         r
@@ -185,7 +185,7 @@ def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float
     return float(weights[0] / scale[0]), power, error
 
 
-#: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
+#: Stiffness assumed without a data sheet's [N/m]: displacement then is right, forces are not.
 ASSUMED_STIFFNESS = 5e7
 #: Stiffness of the wafers over that of the bonding layers, assumed.
 _WAFER_RATIO = 5.0
@@ -208,7 +208,7 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     """Return the base model scaled to the records' voltage span, stroke and sampling.
 
     In the one-way cascade a load meets the bonding layers only, so the stiffness [N/m] that a data
-    sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
+    sheet measures is k_B; it is `ASSUMED_STIFFNESS` if that is None, since voltage and
     displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
     regression slope of displacement on voltage (paper, eq. 14). C_p is that of the measured current
     (`capacitance_of`), else assumed. Raises InputError where that is
@@ -251,8 +251,8 @@ def chosen_start(
 ) -> tuple[Model, bool]:
     """Return where a fit starts, and whether its force scale is known.
 
-    A `model` is taken as it is, but for start values of its own, which belong to its parameters; a
-    `stiffness` [N/m] beside it changes its force scale: all forces, stiffnesses, dampings and
+    A `model` is taken as it is, but for declared start values, which belong to its parameters; a
+    `stiffness` [N/m] with it changes its force scale: all forces, stiffnesses, dampings and
     masses are multiplied by one factor, which displacements do not show.
     """
     if model is None:
@@ -284,7 +284,7 @@ def ordinary_values(
 ) -> dict[str, float]:
     """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the records' size.
 
-    A search that begins with a loop that saturates late may end beside one that does so `soon`.
+    A search that starts from a loop that saturates late may end near one that does so `soon`.
     k_L comes from the regression of displacement on voltage: that of a fitted model may be far off
     it, since a steep loop trades k_L for A.
     """
@@ -301,7 +301,7 @@ def has_loop(model: Model) -> bool:
 
 
 def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
-    """Return lags somewhat below the sampling interval; what is much faster cannot be told."""
+    """Return lags somewhat below the sampling interval; much faster ones are not determined."""
     lags = {
         "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
         "R_s": 0.3 * sample_time / values["C_p"],
@@ -339,7 +339,7 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     """Return k_L, A, beta, gamma [N/V], delta [N/(V.s)] and n of the slowest loops, or None.
 
     Forces follow from the model's stiffnesses by eq. (14), beta and gamma belong to its h_ref.
-    None where no record's voltage turns, or nothing moves. Only where a search begins depends on
+    None where no record's voltage turns, or nothing moves. Only the start of a search depends on
     these values, so they may come from all samples, held-out ones too.
     """
     loops = [_loop(r) for r in _slowest(records)]
@@ -411,7 +411,7 @@ def _rate(record: Record) -> float:
 
 
 def _loop(record: Record) -> _Loop:
-    """Return a record, averaged in blocks where it has many samples; at rest if it begins so."""
+    """Return a record, averaged in blocks if it has many samples; `rests` if it starts at 0 V."""
     valid = record.mask
     y = np.interp(record.time, record.time[valid], measured(record)[valid])
     every = -(-record.n // _SAMPLES)

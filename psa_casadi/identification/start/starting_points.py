@@ -56,7 +56,7 @@ SAMPLES, MOST = 8_000, 4_000
 #: Radii of the play operators that stand for the loop, over the range of the voltage.
 RADII = tuple(k / 16.0 for k in range(1, 9))
 #: Share of its range that a static loop must miss in a record: with a voltage that crosses its
-#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be missed.
+#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be wrong.
 _SHOWS_FAST, _SHOWS_SLOW, _FAST = 0.01, 0.03, 16.0
 #: A record whose voltage takes this many times longer than that of the fastest adds no dynamics.
 _SLOWER = 30.0
@@ -65,11 +65,11 @@ _NOISE = (2e-3, 2e-2)
 _FEWEST = 16
 #: Share of the range within which a response has settled, and within which it is all but over.
 _SETTLED, _OVER = 0.01, 0.05
-#: Share of an excerpt that begins in motion and is given to its transient.
+#: Share of an excerpt that starts in motion which is left out as its transient.
 _LEAD = 0.2
-#: A motion that begins with less than this share of its ordinary rate begins at rest.
+#: A motion that starts with less than this share of its ordinary rate starts at rest.
 _SLOWLY = 0.2
-#: Voltages alike within this share of the range are one level.
+#: Voltages equal within this share of the range are one level.
 _LEVEL = 1e-4
 
 
@@ -241,7 +241,7 @@ def _settled(y: FloatArray, tolerance: float) -> int:
 def _leading_rest(v: FloatArray) -> int:
     """Return how many samples at the start have the first voltage; 0 if it was moving before.
 
-    A single sample counts as a rest where the voltage jumps to a level or begins to move slowly.
+    A single sample counts as a rest where the voltage jumps to a level or starts to move slowly.
     """
     level = _LEVEL * float(np.ptp(v))
     changed = np.flatnonzero(np.abs(v - v[0]) > level)
@@ -268,7 +268,7 @@ def fastest_part(v: FloatArray, length: int) -> int:
 _PRIOR = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
 #: Weak priors, all with standard deviation 1.5: ln of the damping ratios a/(2 sqrt(q)) about 0.7,
 #: which keeps a pole and the zero from cancelling far below the band, and ln (m_P/m_B) about 0,
-#: since wafers and bonding layers with their places exchanged respond alike.
+#: since wafers and bonding layers with their places exchanged respond almost equally.
 _TYPICAL = np.array(
     [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
 ) / 1.5  # fmt: skip
@@ -278,7 +278,7 @@ _TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
 #: way from standing for a fast response behind a slow drive.
 _LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
 #: The same for a shift of the voltage in time, in samples, where it jumps within `_JUMP` samples:
-#: the record does not tell when, between two of them.
+#: the instant between two samples is not known.
 _SHIFT_PRIOR, _JUMP = (0.0, 0.3), 2.0
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
@@ -544,7 +544,7 @@ def placed(
 ) -> Iterator[FloatArray]:
     """Yield theta (7,) for every way to place the poles of an excerpt's response to a source (n,).
 
-    Poles that hardly show are left out; with `weak` also those that do beside the strongest.
+    Poles that hardly show are left out; with `weak` also those that hardly do over the strongest.
     """
     response = [Response(e.h, source, e.y, e.valid, e.sigma)]
     for order in orders:
@@ -562,7 +562,7 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
 
     Oscillations belong to wafers and bonding layers, the slowest real pole to the creep lag or
     the drive, others to the drive or an overdamped pair. What is left open lies at 0.3 of the
-    shortest time found, not below a quarter of the sampling interval.
+    shortest of these times, not below a quarter of the sampling interval.
     """
     times = sorted((1.0 / abs(p) for p in poles if not p.imag), reverse=True)
     tones = sorted((p for p in poles if p.imag > 0), key=abs)
@@ -637,7 +637,7 @@ def _dynamics(
 ) -> list[dict[str, float]]:
     """Return the dynamics to start from: the creep lag the slower one, then the drive's lag.
 
-    A linear response cannot tell the two apart; amplifiers are usually the faster. Where the
+    A linear response does not separate the two; amplifiers are usually the faster. Where the
     sampling resolves no mass, masses stay as they are and the slowest lag is the creep lag.
     """
     near = [dict(c.values) for c in linear if c.misfit < _WORSE * linear[0].misfit]
