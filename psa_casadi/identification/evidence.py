@@ -73,7 +73,7 @@ def evidence_of(
     return Evidence(
         by=by,
         fitted_m=_rms(np.concatenate(used)),
-        seen=_seen(records),
+        seen=_ranges(records),
         covariance=Covariance(determinacy.names, rows) if known else Covariance((), ()),
         runs=tuple(runs),
         reference=_reference(model, records[chosen]),
@@ -93,7 +93,7 @@ def _shown(model: Model, record: Record, x0: FloatArray) -> float:
     return float(y[model.output_names.index(OUTPUT)])
 
 
-def _seen(records: Sequence[Record]) -> SeenRange:
+def _ranges(records: Sequence[Record]) -> SeenRange:
     warm = [t for r in records if (t := r.temperature) is not None]
     rates = []
     for r in records:  # the largest, beyond what the voltage's white noise makes

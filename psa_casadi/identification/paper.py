@@ -47,7 +47,7 @@ _AT_REST = 1e-3
 class Step:
     """The normalised response to one jump of the voltage that is then held.
 
-    `time` (n,) [s] begins at 0 in the middle of the jump, `g` (n,) is (x - x_0)/(x_s - x_0),
+    `time` (n,) [s] is 0 in the middle of the jump, `g` (n,) is (x - x_0)/(x_s - x_0),
     `volts` the height of the jump [V], `k` = (x_s - x_0)/volts [m/V].
     """
 

@@ -107,9 +107,9 @@ def search(
     The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
     (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
     best and the second best are followed to the end, if that one is close or, with `thorough`, not
-    far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
-    keyboard interrupt ends the search at the best fit so far, if there is one. Raises PsaError when
-    no start can be simulated.
+    far, to see whether starts agree; with `thorough` more of them while all leave more than the
+    noise. A keyboard interrupt ends the search at the best fit so far, if there is one. Raises
+    PsaError when no start can be simulated.
     """
     so_far: list[Fit] = []
     off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)

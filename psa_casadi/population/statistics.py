@@ -64,8 +64,8 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
     """Return adjusted p values, shape (n,) as `p`.
 
     `bonferroni` (Holm's step-down form) bounds the chance of one false alarm or more.
-    `benjamini-hochberg` bounds the expected share of false ones among the significant; where nothing is
-    true both bounds are the same.
+    `benjamini-hochberg` bounds the expected share of false ones among the significant; where
+    nothing is true both bounds are the same.
 
     Sources: S. Holm, Scand. J. Statist. 6 (1979) 65; Y. Benjamini and Y. Hochberg, J. R. Statist.
     Soc. B 57 (1995) 289.

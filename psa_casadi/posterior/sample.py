@@ -218,8 +218,8 @@ def sample(
         seed: Seed of all that is random.
         cores: Chains at a time; by default one for each core.
         progress: Gets what is being done, in words.
-        words: Of models other than a stack's those of `psa.identify`: `starts`, `zeros`, `known_start`,
-            `hold`.
+        words: Of models other than a stack's those of `psa.identify`: `starts`, `zeros`,
+            `known_start`, `hold`.
 
     Raises:
         InputError: The extra `sample` is not installed, a name is unknown.

@@ -13,7 +13,7 @@ from psa_casadi.records import Record, sine, time_grid
 from psa_casadi.units import ComplexArray, FloatArray
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
-#: A loop that leads, for which the paper's own condition gamma > beta holds (over k_L).
+#: A loop that leads, for which the paper's condition gamma > beta holds (over k_L).
 LEADING = {"A": 0.25, "beta": 0.05, "gamma": 0.2, "delta": -0.02}
 
 
@@ -87,7 +87,7 @@ def loop(name: str = "P-885.51", frequency: float = 1.0, leading: bool = False) 
 
 @lru_cache(maxsize=4)
 def real_step(volts: float, name: str = "P-885.51") -> Record:
-    """Return the reference's response, hysteresis and all, to a jump of so many volts."""
+    """Return the reference's response, hysteresis and all, to a jump of `volts`."""
     time = np.linspace(0.0, 4e-3, 4001)
     voltage = np.full(time.shape, volts)
     voltage[0] = 0.0

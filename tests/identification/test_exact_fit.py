@@ -96,12 +96,12 @@ def jittered(sigma: float, seed: int = 1) -> Record:
 BASE_UNKNOWNS = ("R_s", "C_p", "k_L", "A", "beta", "gamma", "delta", "n", "tau", "k_P", "c_B")
 NAMES = ("base", *EFFECTS)
 DERIVED_SAMPLES, DERIVED_STEP = 240, 2e-4
-#: What a run at 1e-8 may be off, over the largest value of a column; delta's own jumps.
+#: What a run at 1e-8 may be off, over the largest value of a column; that of delta jumps.
 ALLOWED, OF_DELTA = 2e-3, 1e-2
 
 
 def unknowns_of(name: str, model: Model) -> list[str | int]:
-    """Return the effect's own parameters, some of the base, and initial states."""
+    """Return the effect's parameters, some of the base, and initial states."""
     item = [] if name == "base" else [p.name for p in EFFECTS[name].parameters]
     memories = [s.name for s in model.structure.states if s.memory]
     starts = [model.state_names.index(n) for n in (*memories, "f_out")]

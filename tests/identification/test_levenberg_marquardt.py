@@ -127,7 +127,7 @@ def test_an_iteration_that_is_cut_off_says_so() -> None:
 
 
 def shifted(x: FloatArray) -> Pair:
-    """Rosenbrock's valley above a level that is far from where a search begins."""
+    """Rosenbrock's valley above a level that is far from the start of a search."""
     residual, jacobian = rosenbrock(x[:2])
     far = x[2] - 1e3 + x[0] ** 2
     slope = [2.0 * x[0], 0.0, 1.0]

@@ -108,7 +108,7 @@ def test_a_step_tells_the_transfer_function(name: str, share: float, first: floa
 
 
 def test_a_ringing_step_tells_the_bonding_layers() -> None:
-    """Wafers and bonding layers exchanged respond almost alike: both are among the candidates."""
+    """Wafers and bonding layers exchanged respond almost equally: both are among the candidates."""
     record, truth = step("PTBS200", 1e-3), values_of("PTBS200")
     result, k_B = start(record), starting_model([record]).values["k_B"]
     assert result

@@ -71,7 +71,7 @@ def test_moments_without_noise_and_with_a_little() -> None:
 
 @pytest.mark.parametrize("name", PAPER_STACKS)
 def test_factors_reproduce_the_coefficients(name: str) -> None:
-    """The poles do not tell which part is which, but all six coefficients come back."""
+    """The poles do not show which part is which, but all six coefficients come back."""
     p = values(name)
     exact = coefficients_of_values(p)
     named = dict(zip(COEFFICIENTS, exact.tolist(), strict=True))
@@ -173,7 +173,7 @@ def _quiet(duration: float = 8e-3, samples: int = 40001, **changes: float) -> Re
     return closed_step(values(STACK, **LINEAR, **changes), duration, samples)
 
 
-#: What is given, and what must be said of it.
+#: Records, and the sentence on them.
 FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
     "no step": (lambda: [loop()], "No record is a step"),
     "no loop": (lambda: [_quiet()], "No record is a loop"),

@@ -27,7 +27,7 @@ def truth(name: str) -> dict[str, float]:
 
 @slow
 def test_a_stack_is_found_from_its_records_alone() -> None:
-    """Step, loops and multisine of the reference with 0.1 % noise; no start is given."""
+    """Step, loops and multisine of the reference with 0.1 % noise, without a start."""
     run = one_run("PTBS200", 3)
     assert run.converged
     assert run.rms_ratio == pytest.approx(1.0, abs=0.05)
@@ -65,7 +65,7 @@ def _response(p: dict[str, float], frequency: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize(("part", "other"), ["PB", "BP"])
 def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
-    """With a creep lag that cancels the zero, the oscillator's slow pole is all that is seen."""
+    """With a creep lag that cancels the zero, the oscillator's slow pole is all that shows."""
     p = truth("demo")
     p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
     slow, what = {**p, "tau": 1e-3 * 3e8 / 3.5e8}, {"P": "wafers", "B": "bonding layers"}[part]

@@ -38,7 +38,7 @@ def finding(name: str, k_l: float, **more: Any) -> Finding:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return the files of two diagnoses: one named a cause, one found nothing."""
+    """Return the files of two diagnoses: one named a cause, one names none."""
     folder = tmp_path_factory.mktemp("diagnoses")
     before, after = folder / "before.json", folder / "after.json"
     before.write_text(diagnosis("cause_named").to_json(), encoding="utf-8")
@@ -92,17 +92,17 @@ def test_a_page_has_not_too_many_devices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         ("[]", "is no file of a diagnosis, identification or model"),
         ('{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing"),
         ("{", "is not JSON"),
     ],
 )
-def test_files_that_are_none_are_told(content: str, told: str, tmp_path: Path) -> None:
+def test_files_that_are_none_are_told(content: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(content)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_findings([path])
 
 
@@ -122,7 +122,7 @@ def test_values_that_do_not_belong_are_told_with_their_place(
 
 
 def devices() -> list[Finding]:
-    """Return forty devices of two batches over two years: one stands out, one batch is strong."""
+    """Return forty devices of two batches over two years: an outlier, and a strong batch."""
     rng = np.random.default_rng(4)
     sizes = 7.0 * np.exp(0.01 * rng.standard_normal(40))
     sizes[20:] *= 1.04
@@ -171,7 +171,7 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     named = {x: name for xs, names in marks for x, name in zip(xs, names, strict=True)}
     assert [named[k] for k in axis["tickvals"]] == axis["ticktext"]
     assert set(axis["ticktext"]) == {f"d{k}" for k in range(6)}
-    # found in this parameter by itself, and not among all tests
+    # significant in this parameter by itself, and not among all tests
     assert spread.far.outlying.sum() == 1
     (only,) = spread_plot(replace(result, outliers=()), spread).data
     assert (only["name"], len(only["x"])) == ("belongs to the others", 40)

@@ -1,4 +1,4 @@
-"""Devices that are no stacks: identifications and diagnoses of one's own model side by side."""
+"""Devices that are no stacks: identifications and diagnoses of any model side by side."""
 
 import json
 from dataclasses import replace

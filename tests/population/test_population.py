@@ -73,7 +73,7 @@ def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
         tau_in += fit.tau_interval[0] <= tau <= fit.tau_interval[1]
         mean_in += fit.interval()[0] <= 3.0 <= fit.interval()[1]
         alarms += k < 300 and bool(outliers(y, s).outlying.any())
-    assert 0.925 < tau_in / rounds < (0.97 if tau else 0.99)  # at 0 one end is never missed
+    assert 0.925 < tau_in / rounds < (0.97 if tau else 0.99)  # at 0 one end always covers
     assert 0.925 < mean_in / rounds < 0.985
     assert alarms / 300 < 0.09  # 5 % are meant
 
@@ -141,7 +141,7 @@ def test_errors_that_are_none_are_refused(errors: tuple[float, ...]) -> None:
 
 
 def finding(name: str, k_l: float, half: float, **more: Any) -> Finding:
-    """Return a device with one parameter that is told and one that is not."""
+    """Return a device with one parameter that is determined and one that is not."""
     table = {
         "k_L": Estimate(k_l, "N/V", (k_l * np.exp(-half), k_l * np.exp(half))),
         "tau": Estimate(1e-3, "s", (1e-9, 1.0), determined=False),

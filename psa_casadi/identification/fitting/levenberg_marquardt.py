@@ -62,8 +62,8 @@ def minimise(
 
     A point where the squares of r or J exceed double precision counts as one that cannot be.
 
-    Each step minimises |r + J step|^2 within a radius (Levenberg's damping, found by bisection;
-    Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first as given,
+    Each step minimises |r + J step|^2 within a radius (Levenberg's damping, by bisection;
+    Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first `radius`,
     follows the ratio of actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
     lowers it at all. A keyboard interrupt ends the iteration at the best point so far.

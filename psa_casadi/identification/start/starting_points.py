@@ -596,7 +596,7 @@ def starting_points(
     """Return the starts by name; static gain and loop keep their size where k_P moves.
 
     The loop that the records show comes first, then shapes that loops usually have: fewer of them
-    where the records show a loop, and where they show dynamics to try. The model's own loop where
+    where the records show a loop, and where they show dynamics to try. The model's loop where
     its hysteresis is none of Bouc-Wen's.
     """
     shapes: list[tuple[str, dict[str, float]]] = [("the model's own loop", {})]

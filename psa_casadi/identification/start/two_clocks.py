@@ -173,7 +173,7 @@ _EVEN = 1e-2
 class TwoClocks:
     """What two clocks did to a record: `period` [s] and `height` [s] of the delay's saw tooth.
 
-    `falling` says that the delay falls evenly and jumps up; `moved` (n,) [m] is what each reading
+    `falling`: the delay falls evenly and jumps up; `moved` (n,) [m] is what each reading
     was off by about the mean delay, nan where there is none.
     """
 
