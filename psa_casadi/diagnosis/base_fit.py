@@ -22,9 +22,8 @@ from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.exchanges import force_of, without_blur
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.force_start import retuned
+from psa_casadi.identification.mechanics import force_of, retuned, without_blur
 from psa_casadi.identification.refitting import quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
@@ -200,13 +199,13 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     progress("resonances and lags")
     linear = linear_start(records, base.model.values)
     fastest = min(r.sample_time for r in records)
-    if linear is None or not resolved(base.model, linear.candidates, fastest):
+    if not resolved(base.model, linear, fastest):
         return None
     ordinary = base.model.with_values(ordinary_values(base.model, records))
     best = base
     for model in (ordinary, base.model):
         with suppress(PsaError):
-            item = search(model, experiments, linear=linear.candidates, progress=progress).best
+            item = search(model, experiments, linear=linear, progress=progress).best
             best = min(best, item, key=lambda f: f.rms)
             if item.cost < _AGAIN * len(item.residuals):
                 break

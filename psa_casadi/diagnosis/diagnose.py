@@ -23,10 +23,10 @@ from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify, unfinished
-from psa_casadi.identification.noise_found import noise_found
+from psa_casadi.identification.inputs import even_clock, smooth_between
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
 from psa_casadi.identification.refitting import noise_levels, relevelled
-from psa_casadi.identification.sampling import even_clock, smooth_between
+from psa_casadi.identification.result import noise_found
 from psa_casadi.identification.search import (
     LOAD,
     fit_base,
@@ -42,10 +42,8 @@ from psa_casadi.identification.start.doubts import (
     doubtful_unit,
     doubtful_voltage,
     refuse_few,
-    refuse_other_time,
-    refuse_still,
     refuse_stuck,
-    refuse_wrapped,
+    refuse_unreadable,
 )
 from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
@@ -400,9 +398,7 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
 
     Raises InputError where hardly a sample is left.
     """
-    refuse_still(records)
-    refuse_wrapped(records)
-    refuse_other_time(records)
+    refuse_unreadable(records)
     items = [suspects(r) for r in records]
     clean = [cleaned(r, s) for r, s in zip(records, items, strict=True)]
     saturation = tuple(

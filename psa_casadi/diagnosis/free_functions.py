@@ -29,8 +29,8 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.parts import begun, follows
-from psa_casadi.identification.result import with_told
+from psa_casadi.identification.parts import fit_longer_parts, follows
+from psa_casadi.identification.result import with_origin
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import is_place, ports_of
 from psa_casadi.records.split import Experiment
@@ -58,7 +58,7 @@ def model_of(
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
     sure, inputs = determinacy(fit, experiments), [e.record for e in experiments]
-    return with_told(
+    return with_origin(
         model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
     )  # fmt: skip
@@ -116,7 +116,7 @@ def formula_of(
     item = _told(result, of, place, task, base, effects, scale)
     if len(whole) < len(task.experiments):
         with suppress(PsaError):
-            fit = begun(result.hypothesis.fit, task.experiments, whole)
+            fit = fit_longer_parts(result.hypothesis.fit, task.experiments, whole)
             if follows(fit, whole):
                 added = [*effects, Attached(result.component, port)]
                 item = replace(item, model=model_of(base, fit, added, whole))

@@ -30,7 +30,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
 from psa_casadi.diagnosis.search.known import Known
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
-from psa_casadi.identification.result import MISSED
+from psa_casadi.identification.result import EXCESSIVE
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment, missed_rms
@@ -150,7 +150,7 @@ class Judge:
         """Weigh the causes that one hypothesis has more than another against corrections of that.
 
         Without any corrections where it is not `beside` them. A channel counts by itself where
-        there are several, and the other's held-out rms is above `MISSED` times the noise:
+        there are several, and the other's held-out rms is above `EXCESSIVE` times the noise:
 
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
@@ -161,7 +161,7 @@ class Judge:
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
             for f, base, left, floor in rows
-            if len(rows) > 1 and base > MISSED * floor
+            if len(rows) > 1 and base > EXCESSIVE * floor
         }
         return Weighed(
             evidence=scale.evidence(after) - scale.evidence(before),

@@ -113,7 +113,7 @@ def knowable(
 
 def knowable_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
     """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
-    error = max((s.error for s in fit.simulated), default=0.0)
+    error = max((s.errors[0] for s in fit.simulated if s.errors), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
     parts = fit.residuals_of(experiments)
     squares = [

@@ -23,9 +23,9 @@ from psa_casadi.diagnosis.search.rivals import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.experiments import (
+    column_notes,
     experiments_of,
     given_to,
-    told_of_columns,
     undecided,
 )
 from psa_casadi.identification.fitting.fit import Fit
@@ -39,9 +39,18 @@ from psa_casadi.identification.inputs import (
     refitted,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
-from psa_casadi.identification.noise_found import noise_found
-from psa_casadi.identification.parts import NEAR, Made, begun, cut, follows, forgets, settled, ways
+from psa_casadi.identification.parts import (
+    NEAR,
+    Made,
+    cut,
+    fit_longer_parts,
+    follows,
+    forgets,
+    settled,
+    ways,
+)
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
+from psa_casadi.identification.result import noise_found
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
 from psa_casadi.notes import Note, note
@@ -123,7 +132,7 @@ def diagnose_ode(
         *notes,
         *judge.known.remarks,
         *_entering(judge.final.view.of),
-        *told_of_columns(model, judge.experiments),
+        *column_notes(model, judge.experiments),
     )
     return answer.with_noise(noise, remarks)
 
@@ -314,14 +323,14 @@ def _of_whole(known: Known, task: Task) -> Known | None:
     best, parts = known.answer, known.task.experiments
     task.progress("fitting the whole records")
     try:
-        top = begun(best.fit, parts, task.experiments)
+        top = fit_longer_parts(best.fit, parts, task.experiments)
         if not best.causes or not follows(top, task.experiments):
             return None
-        base = begun(known.root.fit, parts, task.experiments)
+        base = fit_longer_parts(known.root.fit, parts, task.experiments)
         result = Known(levelled(base, task.experiments)[0], task)
         for h in (h for h in known.found.values() if h.causes and h.final):
             with suppress(PsaError):
-                fit = top if h is best else begun(h.fit, parts, task.experiments)
+                fit = top if h is best else fit_longer_parts(h.fit, parts, task.experiments)
                 result.note(hypothesis(h.causes, fit, task.experiments, final=True))
         result.conclude()
     except PsaError:

@@ -33,14 +33,14 @@ STEP_SAMPLES, MULTISINE_SAMPLES, LOOP_SAMPLES, HOLD_SAMPLES = 2000, 3000, 400, 2
 _BAND = 0.2
 #: Sampling intervals that are tried, at most.
 _RUNGS = 6
-#: Samples within the shortest lag at the fastest rate worth trying.
+#: Samples within the shortest lag at the fastest rate that is tried.
 _FINEST = 5.0
 #: A loop this much slower than the stack's settling is quasi-static.
 _QUASI_STATIC = 0.05
 _CYCLES = 6
 #: Parameters that stand for a lag.
 _LAGS = ("tau", "R_s", "c_P", "c_B", "c")
-#: Longest loops worth advising have this frequency [Hz].
+#: Longest loops that are advised have this frequency [Hz].
 _SLOWEST = 1e-3
 _LONGEST_HOLD = 7200.0
 
@@ -147,7 +147,7 @@ def _loops(frequency: float, settling: float, low: float, high: float) -> Iterat
 #: Parameters that only fast records determine; a fit leaves them at their start where it must.
 SEARCHABLE = ("tau", "R_s", "c_P", "c_B", "c", "m_P", "m_B", "m")
 #: Weights by which the open lags share their sum, and the damping ratio of open masses. No two
-#: lags are equal: two equal poles cannot be told apart by any record.
+#: lags are equal: no record separates two equal poles.
 _CASES: tuple[tuple[Mapping[str, float], float], ...] = (
     ({"tau": 10.0, "R_s": 2.0, "c_P": 1.0, "c_B": 4.0, "c": 4.0}, 2.0),
     ({"tau": 2.0, "R_s": 4.0, "c_P": 1.0, "c_B": 10.0, "c": 10.0}, 0.3),
@@ -180,7 +180,7 @@ def scenarios(model: Model, open_names: Collection[str]) -> list[Model]:
 
 
 def _lag(values: Mapping[str, float], name: str) -> float:
-    """Return the lag [s] that a parameter stands for."""
+    """Return the lag [s] of a parameter."""
     if name == "tau":
         return values["tau"]
     if name == "R_s":
@@ -205,7 +205,7 @@ class Advice(Worded):
     `single` does so by itself, as well as those `instead` of it, `together` with what is advised
     before it. `plan` is None where the advice is none to measure a record: masses that show if the
     mechanics ring (`ringing`), parameters that none of the plans `tried` determines (`nothing`),
-    and the scale of `force`, which no record tells.
+    and the scale of `force`, which no record determines.
     """
 
     kind: Literal["single", "together", "ringing", "nothing", "force"]
@@ -245,31 +245,24 @@ def advice(
 class _Adviser:
     """The information at hand and in every plan, for the fit's parameters and the fixed lags."""
 
-    def __init__(self, fit: Fit, experiments: Sequence[Experiment], found: Determinacy) -> None:
-        self._fit, self._found, self._experiments = fit, found, experiments
-        extra = [n for n in SEARCHABLE if n in fit.model.values and n not in found.names]
-        self._names = (*found.names, *extra)
+    def __init__(self, fit: Fit, experiments: Sequence[Experiment], of: Determinacy) -> None:
+        self._fit, self._determinacy, self._experiments = fit, of, experiments
+        extra = [n for n in SEARCHABLE if n in fit.model.values and n not in of.names]
+        self._names = (*of.names, *extra)
         self._noise = max(fit.rms, min(fit.sigma))
-        known, count = self._at_hand(fit.model), len(found.names)
+        known, count = self._at_hand(fit.model), len(of.names)
         # by how much the residuals' level and colour widen the intervals, squared
-        prior = prior_information(fit.model, found.names)
-        white = standard_errors(known[:count, :count] + prior)
-        sizes = np.abs(sizes_of(fit.model, found.names))
-        output = np.array([found.standard_errors[n] for n in found.names]) / sizes
-        sure = output < DETERMINED_WIDTH
-        ratio = max(float(np.median((output / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
+        white = standard_errors(known[:count, :count] + prior_information(fit.model, of.names))
+        sizes = np.abs(sizes_of(fit.model, of.names))
+        relative = np.array([of.standard_errors[n] for n in of.names]) / sizes
+        sure = relative < DETERMINED_WIDTH
+        ratio = max(float(np.median((relative / white)[sure] ** 2)), 1.0) if sure.any() else 1.0
         errors = standard_errors(known / ratio + prior_information(fit.model, self._names))
-        self._open = {
-            n
-            for k, n in enumerate(self._names)
-            if n in found.undetermined or (n in extra and errors[k] > DETERMINED_WIDTH)
-        }
-        self._scenarios = scenarios(fit.model, self._open)
+        wide = {n for n, e in zip(self._names, errors, strict=True) if e > DETERMINED_WIDTH}
+        self._open = {*of.undetermined, *(wide & set(extra))}
+        self._scenarios = scenarios(fit.model, self._open) if self._open else []
         self._known = np.array(
-            [
-                self._at_hand(m) / ratio + prior_information(m, self._names)
-                for m in (self._scenarios if self._open else ())
-            ]
+            [self._at_hand(m) / ratio + prior_information(m, self._names) for m in self._scenarios]
         )
 
     def _at_hand(self, model: Model) -> FloatArray:
@@ -299,13 +292,13 @@ class _Adviser:
             known, counts[plan] = known + information, 1
             instead = tuple(  # plans of the other fast kind that do as well at the same rate
                 other
-                for other, item in options
+                for other, its_information in options
                 if other.rate == plan.rate
                 and {other.kind, plan.kind} == {"step", "multisine"}
-                and set(gain) <= set(self._gain(self._known + item, self._open))
+                and set(gain) <= set(self._gain(self._known + its_information, self._open))
             )
             results.append(Advice("single", gain, plan, instead=instead))
-        wanted = left & set(self._found.names)
+        wanted = left & set(self._determinacy.names)
         while wanted and (more := self._more(options, known, wanted)) is not None:
             plan, information, repeats = more
             known = known + repeats * information

@@ -17,9 +17,9 @@ from psa_casadi.variables import Values
 
 #: A combination is known if its relative standard error is below this ...
 KNOWN = 0.1
-#: ... and each parameter that trades off in it would alone give it an error so many times larger.
+#: ... and each parameter that trades off in it would alone give it an error this much larger.
 SURER = 5.0
-#: Parameters with a relative standard error above this are asked for what they trade off with.
+#: Parameters with a relative standard error above this may trade off with others.
 WEAK = 0.05
 #: Two parameters whose correlation is above this are tied.
 TIED = 0.5
@@ -83,7 +83,7 @@ FORMULAS = tuple(
 def physical_formulas(values: Values, free: Sequence[str]) -> list[Formula]:
     """Return the formulas with a meaning that hold two or more free parameters.
 
-    Beside `FORMULAS` sums of two and more lags, the mechanics' with and without its zero, eq. (15).
+    `FORMULAS`, and sums of two and more lags, the mechanics' with and without its zero, eq. (15).
     A lag without a free parameter is a constant, which would only make the sum look sure.
     """
     known = [
@@ -125,7 +125,7 @@ class Combination(Worded):
 
     `known` is the formula that the data determine with the relative standard error
     `relative_error` (nan where it follows from the model's form), `meaning` what it is; None and ""
-    where none was found. `kind` is `only` where nothing but the formula is determined, `traded`
+    where none is known. `kind` is `only` where nothing but the formula is determined, `traded`
     where the parameters are determined worse than it (with the errors `alone`), `group` where no
     formula of them is known, `tied` where the first trades off with the others, `free` where the
     data hardly depend on any; `product` and `force` follow from the model's form.
@@ -144,7 +144,7 @@ def free_combinations(
 ) -> tuple[Combination, ...]:
     """Return what is known of parameters that trade off, in as few and simple formulas as possible.
 
-    Parameters with a standard error above 5 % are asked. A formula explains those in it whose
+    For parameters with a standard error above 5 %. A formula explains those in it whose
     errors cancel: it is known to 10 %, and to a fifth of the error that each of them alone would
     give it (delta method with the covariance of the values). Formulas with a meaning are tried
     first (`FORMULAS`, sums of lags), those that explain much with few parameters and small errors
@@ -180,8 +180,8 @@ def free_combinations(
 class _Judge:
     """Standard errors of formulas, from the covariance of the values."""
 
-    def __init__(self, model: Model, found: Determinacy) -> None:
-        self._model, self._found = model, found
+    def __init__(self, model: Model, determinacy: Determinacy) -> None:
+        self._model, self._determinacy = model, determinacy
 
     def known(self, formula: Formula) -> tuple[Combination, float] | None:
         """Return what is known far better than its parameters, else None.
@@ -189,7 +189,7 @@ class _Judge:
         With it comes a rank, the smallest for a formula that is sure and short: its standard error
         over what one of the parameters would make it, doubled by each parameter that is free.
         """
-        result, names = self._found, self._found.names
+        result, names = self._determinacy, self._determinacy.names
         order = formula.names if formula.physical else names
         free = [n for n in order if n in names and n in formula.names]
         values, gradient = self._model.values, np.zeros(len(names))
@@ -218,7 +218,8 @@ class _Judge:
             for member in group:  # grows while it is walked
                 group += [n for n in left if self._tied(member, n)]
                 left = [n for n in left if n not in group]
-            others = [n for n in self._found.names if n not in names and self._tied(group[0], n)]
+            other_names = [n for n in self._determinacy.names if n not in names]
+            others = [n for n in other_names if self._tied(group[0], n)]
             if len(group) > 1:
                 yield Combination("group", tuple(group))
             elif others:
@@ -230,12 +231,12 @@ class _Judge:
 
     def relative(self, name: str) -> float:
         """Return a parameter's standard error over its value."""
-        return self._found.standard_errors[name] / self._size(name)
+        return self._determinacy.standard_errors[name] / self._size(name)
 
     def _size(self, name: str) -> float:
         values = self._model.values
         return abs(values[name]) or self._model.parameter(name).typical(values)
 
     def _tied(self, one: str, other: str) -> bool:
-        row, column = self._found.names.index(one), self._found.names.index(other)
-        return bool(one != other and abs(self._found.correlations[row, column]) > TIED)
+        row, column = (self._determinacy.names.index(n) for n in (one, other))
+        return bool(one != other and abs(self._determinacy.correlations[row, column]) > TIED)

@@ -11,7 +11,7 @@ from psa_casadi.identification.fitting.unknowns import (
     LINEAR_PRIOR,
     LOG_PRIOR,
     memory_prior,
-    memory_sizes,
+    memory_starts,
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import autocovariance, convolved
@@ -151,7 +151,7 @@ def covariance_of(
 def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | None:
     """Return the change of theta (size,) by one standard deviation of the assumed ln(k_P / k_B).
 
-    k_P / k_B sets the zero -(k_P + k_B)/(c_P + c_B) beside the static gain, eqs. (11), (14). Where
+    k_P / k_B sets the zero -(k_P + k_B)/(c_P + c_B) and the static gain, eqs. (11), (14). Where
     it is assumed and not searched, lags and masses carry its error: with c_P/k_P, m_P/k_P and all
     displacements held, d theta = -H^-1 J^T W dx/d ln(k_P / k_B). Forces keep their proportion to
     the assumed stiffness and carry none. None where k_P is searched or the model has none.
@@ -215,7 +215,8 @@ def record_information(
     `start`), which a fit would estimate with their weak priors, and the sensor's offset can
     imitate; sigma [m] is the white noise. The record needs no displacement. Raises SimulationError.
     """
-    sizes = memory_sizes(model) if sizes is None else sizes
+    if sizes is None:
+        sizes = {n: size for n, (size, _) in memory_starts(model).items()}
     start = dict.fromkeys(sizes, 0.0) if start is None else start
     # loose steps would make information: errors of a large derivative look like a direction
     _, by_parameter, by_start = predict_record(
@@ -236,5 +237,5 @@ def record_information(
 
 
 def standard_errors(information: FloatArray) -> FloatArray:
-    """Return the standard errors (k,) that an information matrix stands for."""
+    """Return the standard errors (k,) of an information matrix."""
     return np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))

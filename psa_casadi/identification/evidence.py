@@ -1,4 +1,4 @@
-"""What stands behind a fitted model, to be kept with it: ranges, covariance, runs to play again."""
+"""The evidence of a fitted model: ranges of its inputs, covariance, runs to simulate again."""
 
 from collections.abc import Sequence
 
@@ -27,7 +27,7 @@ from psa_casadi.variables import Interval
 _LONGEST, _MISSED = 300, 2e-3
 #: Digits of a reference run's samples, of their largest value.
 _DIGITS = 7
-#: Differences of neighbouring samples are noise up to so many of its standard deviations.
+#: Differences of neighbouring samples are noise up to this many of its standard deviations.
 _NOISE = 6.0 * np.sqrt(2.0)
 
 
@@ -40,10 +40,10 @@ def evidence_of(
     by: str,
     sampled: Sequence[Record] = (),
 ) -> Evidence:
-    """Return the evidence of a fit: what was seen, how sure the values are, runs to play again.
+    """Return the evidence of a fit: ranges of the inputs, covariance, runs to simulate again.
 
     `predicted` [m] are the records in full, in the order of `experiments`; `sampled` the records
-    as they were given, where samples of them were averaged. Held-out samples have the error of the
+    before block averages, if there are any. Held-out samples have the error of the
     runs; its interval and the budget are the diagnosis's to add.
     """
     model, records = fit.model, [e.record for e in experiments]
@@ -73,7 +73,7 @@ def evidence_of(
     return Evidence(
         by=by,
         fitted_m=_rms(np.concatenate(used)),
-        seen=_seen(records),
+        seen=_ranges(records),
         covariance=Covariance(determinacy.names, rows) if known else Covariance((), ()),
         runs=tuple(runs),
         reference=_reference(model, records[chosen]),
@@ -93,7 +93,7 @@ def _shown(model: Model, record: Record, x0: FloatArray) -> float:
     return float(y[model.output_names.index(OUTPUT)])
 
 
-def _seen(records: Sequence[Record]) -> SeenRange:
+def _ranges(records: Sequence[Record]) -> SeenRange:
     warm = [t for r in records if (t := r.temperature) is not None]
     rates = []
     for r in records:  # the largest, beyond what the voltage's white noise makes
@@ -112,26 +112,25 @@ def _interval(columns: Sequence[FloatArray]) -> Interval:
 
 
 def _reference(model: Model, record: Record) -> ReferenceRun:
-    """Return the longest first part of a record whose voltage so few samples tell."""
+    """Return the longest first part of a record whose voltage `_LONGEST` samples interpolate."""
     stride = 1
-    while stride < record.n // 8 and _told_by(record, 2 * stride):
+    while stride < record.n // 8 and _is_interpolated(record, 2 * stride):
         stride *= 2
     kept = np.arange(0, min(record.n, _LONGEST * stride), stride)
     columns = {n: getattr(record, n, None) for n in model.input_names}
-    inputs = {n: _rounded(c[kept]) for n, c in columns.items() if c is not None}
-    displayed = measured(record)[kept]
-    valid = np.isfinite(displayed)
-    digits = iter(_rounded(displayed[valid]))
+    y = measured(record)[kept]
+    valid = np.isfinite(y)
+    rounded = iter(_rounded(y[valid]))
     return ReferenceRun(
         record=record.name,
         time=tuple(round(float(t), 12) for t in record.time[kept] - record.time[0]),
-        inputs=inputs,
-        displacement=tuple(next(digits) if v else None for v in valid),
+        inputs={n: _rounded(c[kept]) for n, c in columns.items() if c is not None},
+        displacement=tuple(next(rounded) if v else None for v in valid),
     )
 
 
-def _told_by(record: Record, stride: int) -> bool:
-    """Whether every so many samples tell the voltage that lies between them."""
+def _is_interpolated(record: Record, stride: int) -> bool:
+    """Whether straight lines between every `stride`-th sample follow the voltage."""
     part = slice(0, min(record.n, (_LONGEST - 1) * stride + 1))
     time, voltage = record.time[part], record.voltage[part]
     lines = np.interp(time, time[::stride], voltage[::stride])

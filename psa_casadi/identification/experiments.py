@@ -17,7 +17,7 @@ from psa_casadi.records.split import Channel, Experiment, divided, whole, withou
 from psa_casadi.records.suspects import suspects_of
 from psa_casadi.units import FloatArray, convert, parse_unit, si_unit
 
-#: Share of an output's range below which no difference between a device and a model is told.
+#: Share of an output's range below which a difference of device and model does not count.
 STRAIGHT = 2e-5
 #: Noise level to begin with, over an output's standard deviation.
 _FIRST_LEVEL = 0.1
@@ -29,7 +29,7 @@ def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> l
 
 
 def undecided(records: Any, hold: Hold | None) -> bool:
-    """Whether nobody said what inputs do between samples: no `hold`, and no `Signals`."""
+    """Whether it is open what inputs do between samples: no `hold`, and no `Signals`."""
     inputs = records if isinstance(records, list | tuple) else [records]
     return hold is None and not any(isinstance(r, Signals) for r in inputs)
 
@@ -48,7 +48,7 @@ def experiments_of(
     Those of `holdout`, but for the tenth that finds their state; without such a record a quarter of
     every one in blocks, as `split` chooses them along the input that moves most. Columns are
     converted to the model's units; samples that an output's sensor has made are masked. Channels
-    are the outputs that move; those of `zeros` have an offset of their own in every record.
+    are the outputs that move; those of `zeros` have an offset in every record.
 
     Raises InputError for inputs that are missing or have gaps, for units that measure something
     else, and where no output was measured.
@@ -69,7 +69,7 @@ def experiments_of(
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
     records = cast("Sequence[Any]", [items for part in clean for items in part])
-    values: dict[str, float] = {}  # a part of a record begins anywhere
+    values: dict[str, float] = {}  # first instants: a part of a record may start later
     for s, _ in records:
         values[s.sha256] = min(s.time[0], values.get(s.sha256, np.inf))
     result = [
@@ -84,9 +84,9 @@ def experiments_of(
         channel = Channel(
             o.name, o.unit, (o.name,), straight=STRAIGHT, offset=o.name in zeros, factors=False
         )
-        items = [replace(e, channels=(channel,)) for e in result]
-        fitted_ones = np.concatenate([e.measured(0)[e.at(0)] for e in items])
-        spread = float(np.std(fitted_ones)) if fitted_ones.size else 0.0
+        alone = [replace(e, channels=(channel,)) for e in result]
+        readings = np.concatenate([e.measured(0)[e.at(0)] for e in alone])
+        spread = float(np.std(readings)) if readings.size else 0.0
         if spread > 0.0:
             channels.append(replace(channel, level=_FIRST_LEVEL * spread))
     if not channels:
@@ -115,13 +115,13 @@ def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note | str, ...]]
 
 
 def varied(model: Model, e: Experiment) -> str | None:
-    """Return the input that moves most, over its own size; None where none does."""
+    """Return the input that moves most, over its size; None if none moves."""
     spans = {n: _moves(e.record.column(n)) for n in model.input_names}
     most = max(spans, key=lambda n: spans[n], default=None)
     return most if most is not None and spans[most] > 0 else None
 
 
-def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
+def column_notes(model: Model, experiments: Sequence[Experiment]) -> tuple[Note | str, ...]:
     """Return which inputs look held between samples and are read as lines, which outputs lack.
 
     And what units were not stated, and which samples are masked.
@@ -151,7 +151,7 @@ def told_of_columns(model: Model, experiments: Sequence[Experiment]) -> tuple[No
 
 def _units(model: Model) -> dict[str, str]:
     inputs, outputs = model.structure.inputs, model.structure.outputs
-    return {**{v.name: v.unit for v in inputs}, **{v.name: v.unit for v in outputs}}
+    return {v.name: v.unit for v in inputs} | {v.name: v.unit for v in outputs}
 
 
 def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
@@ -179,7 +179,7 @@ def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
 
 
 def _declare(model: Model, name: str, unit: str) -> str:
-    """Return how a unit is declared; that of an FMU is what its description says."""
+    """Return how a unit is declared; that of an FMU is in its description."""
     kind = "Input" if name in model.input_names else "Output"
     return (
         "" if model.structure.foreign else f"declare it, as psa.{kind}('{name}', '{unit}', ''), or "

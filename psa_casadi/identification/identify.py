@@ -10,11 +10,16 @@ from psa_casadi.identification.combinations import Combination, free_combination
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.noise_found import noise_found
+from psa_casadi.identification.inputs import even_clock
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
 from psa_casadi.identification.refitting import record_rms, refit, relevelled
-from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
-from psa_casadi.identification.sampling import even_clock
+from psa_casadi.identification.result import (
+    EXCESSIVE,
+    Identification,
+    doubts_of,
+    noise_found,
+    with_origin,
+)
 from psa_casadi.identification.search import loads_as_curves, search_forms
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
@@ -23,9 +28,7 @@ from psa_casadi.identification.start.doubts import (
     doubtful_unit,
     doubtful_voltage,
     refuse_few,
-    refuse_other_time,
-    refuse_still,
-    refuse_wrapped,
+    refuse_unreadable,
 )
 from psa_casadi.identification.start.ordinary import (
     Hysteresis,
@@ -33,7 +36,7 @@ from psa_casadi.identification.start.ordinary import (
     chosen_start,
     forms_of,
 )
-from psa_casadi.identification.start.starting_points import linear_start
+from psa_casadi.identification.start.starting_points import LinearCandidate, linear_start
 from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
@@ -47,7 +50,7 @@ from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
 from psa_casadi.shown import made
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 
-#: Rounds of fitting with every record's own residual as its noise level.
+#: Rounds of fitting with every record's residual as its noise level.
 _LEVEL_ROUNDS = 2
 
 #: What may be unlike a stack's in records.
@@ -62,7 +65,7 @@ class StackIdentification(Identification):
     """The identification of a stack.
 
     `combinations` holds what is known of parameters that trade off; `advice` the further records
-    that would determine what is open. `read_off` names parameters that were found without a fit
+    that would determine what is open. `read_off` names parameters that are estimated without a fit
     (the paper's method).
     """
 
@@ -89,17 +92,15 @@ def identify(
 
     `records` are those of one device: a record, the path of a file, a data frame or a mapping of
     arrays (see `record_from`), or several of these.
-    Maximum likelihood over all records together: every record has its own noise level (its
-    residual's), initial state and offset. `stiffness` is the free stack's stiffness [N/m] from a
-    data sheet; without it forces keep the scale of an assumed stiffness, and the model says so.
+    Maximum likelihood over all records together: every record has a noise level (its residual's),
+    an initial state and an offset. `stiffness` is the free stack's stiffness [N/m] from a
+    data sheet; without it forces keep the scale of an assumed stiffness, which the model notes.
     `hysteresis` is its form: `bouc-wen` (as in the base model), a `spectrum` of elements (see
     `memory_spectrum`), or the `best` of them by Schwarz's criterion. A keyboard interrupt ends the
-    search with the best fit so far, which `warnings` then says. Raises InputError, SimulationError.
+    search with the best fit so far, with a warning. Raises InputError, SimulationError.
     """
     given_records = records_given(records)
-    refuse_still(given_records)
-    refuse_wrapped(given_records)
-    refuse_other_time(given_records)
+    refuse_unreadable(given_records)
     parts, cut = without_gaps(given_records)
     ready = [prepared(r) for r in parts]
     every = [r for r, _ in ready]
@@ -113,19 +114,15 @@ def identify(
     start = forms[0]
     experiments = with_levels([whole(r) for r in fitted], columns.fitted)
     experiments = loads_as_curves(start, experiments, progress)
-    linear = None
+    linear: tuple[LinearCandidate, ...] = ()
     if model is None:
         progress("starting values from the records")
         linear = linear_start(fitted, start.values)
     result, preferred = search_forms(
-        forms,
-        experiments,
-        linear=linear.candidates if linear else (),
-        thorough=True,
-        progress=progress,
+        forms, experiments, linear=linear, thorough=True, progress=progress
     )
     best, experiments = _on_even_clock(*relevelled(result.best, experiments), items)
-    best = _with_own_levels(best, experiments, progress)
+    best = _with_record_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
     determined = determinacy(
@@ -165,7 +162,7 @@ def identify(
         doubts=(
             *(s for doubt in _DOUBTS if (s := doubt(fitted))),
             *doubts_of(best, determined, result.starts, result.not_unique),
-            *_missed(best, experiments),
+            *_excess_notes(best, experiments),
         ),
         starts=result.starts,
         notes=(
@@ -191,13 +188,13 @@ def with_provenance(
     interrupted: bool = False,
     evidence: Evidence | None = None,
 ) -> Model:
-    """Return a fitted model that says from which records it comes and how sure its values are."""
+    """Return a fitted model with its records, intervals and notes as its provenance."""
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
     fits = current is not None and current.source == "current" and current.is_that_of(c_p)
     output = {"C_p": current.interval} if current is not None and fits else {}
     return replace(
-        with_told(
+        with_origin(
             model, records, result.names, {**output, **result.intervals},
             force_scale="given" if stiffness_given else "assumed",
             interrupted=interrupted,
@@ -213,7 +210,7 @@ def with_provenance(
 
 def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> Model:
     """Return the model of the best fit so far, marked as that of a search that was interrupted."""
-    return with_told(
+    return with_origin(
         best.model, records, best.unknowns.names, {},
         force_scale="given" if stiffness_given else "assumed",
         notes=(str(INTERRUPTED), *(() if stiffness_given else (str(FORCE_NOTE),))),
@@ -234,8 +231,8 @@ def _on_even_clock(
     return best, experiments
 
 
-def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Fit again with every record's residual as its noise level: the likelihood's own estimate.
+def _with_record_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+    """Fit again with every record's residual as its noise level: its maximum-likelihood estimate.
 
     One record alone needs no second fit, since a common factor moves nothing but the weak priors.
     """
@@ -252,13 +249,13 @@ def _with_own_levels(best: Fit, experiments: Sequence[Experiment], progress: Pro
     return best
 
 
-def _missed(best: Fit, experiments: Sequence[Experiment]) -> list[Note]:
-    """Return the records that a fit misses by more than their noise."""
+def _excess_notes(best: Fit, experiments: Sequence[Experiment]) -> list[Note]:
+    """Return notes on the records whose residual exceeds their noise."""
     notes = []
     for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)
-        if noise > 0 and rms > MISSED * noise:
+        if noise > 0 and rms > EXCESSIVE * noise:
             notes.append(note("missed", record=e.record.name, times=rms / noise))
     return notes

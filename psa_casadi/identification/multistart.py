@@ -17,9 +17,7 @@ from psa_casadi.identification.refitting import (
     weighted,
     with_noise,
 )
-from psa_casadi.identification.result import (
-    StartOutcome,
-)
+from psa_casadi.identification.result import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.progress import Progress, silent
 from psa_casadi.records.split import Experiment
@@ -28,15 +26,13 @@ from psa_casadi.variables import Parameter
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2
-#: Starts whose costs differ by less than this share have found the same minimum.
+#: Starts whose costs differ by less than this share have the same minimum.
 _SAME = 0.01
-#: Starts lie within so many natural logarithms, or ordinary changes, of the declared value.
+#: Starts lie within this many natural logarithms, or ordinary changes, of the declared value.
 _DECADES, _CHANGES = 2.3, 2.0
 _SEED = 29
-#: Samples at least from which a rate is told.
+#: Fewest samples for a rate.
 _SLOPE = 8
-#: A fit that leaves this share of an output's standard deviation explains nothing of it.
-_ALL = 0.8
 
 
 def free_of(model: Model, free: Sequence[str] | None) -> tuple[str, ...]:
@@ -103,13 +99,12 @@ def search_starts(
     can be simulated.
     """
     sigma = [experiments[0].channels[0].level] * len(experiments)
-    observed = seen_starts(model, experiments)
+    observed = observed_starts(model, experiments)
     rng, declared = np.random.default_rng(_SEED), model.values
-    drawn = [{n: _drawn(model.parameter(n), declared, rng) for n in free} for _ in range(1, starts)]
-    begin_times = [
-        ("declared values", {}),
-        *((f"random values {k}", v) for k, v in enumerate(drawn, 1)),
-    ]
+    points: list[tuple[str, dict[str, float]]] = [("declared values", {})]
+    for k in range(1, starts):
+        drawn = {n: _drawn(model.parameter(n), declared, rng) for n in free}
+        points.append((f"random values {k}", drawn))
 
     def quick(name: str, values: Mapping[str, float]) -> Fit:
         progress(f"fit from {name}")
@@ -120,20 +115,20 @@ def search_starts(
         )  # fmt: skip
 
     try:
-        items = sorted(fits_from(begin_times, quick), key=lambda pair: pair[1].cost)
+        ranked = sorted(fits_from(points, quick), key=lambda pair: pair[1].cost)
     except PsaError as error:
         raise SimulationError(
             f"The model '{model.name}' cannot be simulated on these records from any start; check"
             f" the units of its inputs, its values and their bounds. At its own values: {error}"
         ) from error
-    cut = any(f.interrupted for _, f in items)
+    cut = any(f.interrupted for _, f in ranked)
     ended = [
         refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
-        for _, f in items[: 0 if cut or starts == 1 else _FOLLOWED]
+        for _, f in ranked[: 0 if cut or starts == 1 else _FOLLOWED]
     ]
-    fits = dict(items) | {name: f for (name, _), f in zip(items, ended, strict=False)}
+    fits = dict(ranked) | {name: f for (name, _), f in zip(ranked, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)
-    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in begin_times)
+    outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in points)
     if cut:
         return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
     return *levelled(best, experiments), outcomes
@@ -155,7 +150,7 @@ def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:
     return StartOutcome(name, end.cost, end.rms, True if same else None)
 
 
-def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
+def observed_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[str, float]]:
     """Return deviations of initial states that an output shows at its first samples.
 
     A state that an output is, and one that is the rate of such a state.
@@ -163,26 +158,26 @@ def seen_starts(model: Model, experiments: Sequence[Experiment]) -> list[dict[st
     y, x, der = model.structure.y, model.structure.x, model.structure.der
     names = [x[k].name() for k in range(x.numel())]
     starts = {q.name: q.start for q in model.structure.states}
-    items = [
-        (model.output_names[j], y[j].name())
-        for j in range(y.numel())
+    pairs = [
+        (output, y[j].name())
+        for j, output in enumerate(model.output_names)
         if y[j].is_symbolic() and y[j].name() in names
     ]
     result = []
     for e in experiments:
-        item, known = {}, e.known if e.held_out_whole else e.used
-        for output, state in items:
+        deviations, known = {}, e.known if e.held_out_whole else e.used
+        for output, state in pairs:
             readings = e.record.column(output)
             if readings is None or e.known_start:
                 continue
             valid = np.flatnonzero(known & np.isfinite(readings))
             if valid.size:
-                item[state] = float(readings[valid[0]]) - starts[state]
+                deviations[state] = float(readings[valid[0]]) - starts[state]
             rate, first = ca.SX(der[state]), valid[: max(_SLOPE, valid.size // 16)]
             if rate.is_symbolic() and rate.name() in starts and first.size >= _SLOPE:
                 slope = np.polyfit(e.record.time[first], readings[first], 1)[0]
-                item[rate.name()] = float(slope) - starts[rate.name()]
-        result.append(item)
+                deviations[rate.name()] = float(slope) - starts[rate.name()]
+        result.append(deviations)
     return result
 
 

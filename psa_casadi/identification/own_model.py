@@ -1,4 +1,4 @@
-"""Identify a model of one's own from its records."""
+"""Identify any model from its records."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,15 +8,20 @@ import numpy as np
 
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import (
+    column_notes,
     experiments_of,
     given_to,
-    told_of_columns,
     undecided,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, refuse_unfit
-from psa_casadi.identification.noise_found import noise_found
 from psa_casadi.identification.parts import cut, ways
-from psa_casadi.identification.result import MISSED, Identification, doubts_of, with_told
+from psa_casadi.identification.result import (
+    EXCESSIVE,
+    Identification,
+    doubts_of,
+    noise_found,
+    with_origin,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
@@ -43,10 +48,10 @@ def identify_ode(
     `records` are `Signals`, tables with a column `time`, or CSV files, whose columns bear the names
     of the model's inputs and outputs. Between samples inputs are straight lines, or constant with
     `hold="zero"`. Maximum likelihood over all outputs, each with the noise level that it leaves,
-    and where the noise of records differs, each with its own; the parameters stay within their
+    and if the noise of records differs, each with its level; the parameters stay within their
     bounds. `free` names the parameters to fit, all that are `fitted` by default. The initial state
     of every record is estimated too, unless it is known to be the declared one (`known_start`).
-    `zeros` names outputs whose zero is unknown in each record. The search begins at the declared
+    `zeros` names outputs whose zero is unknown in each record. The search starts at the declared
     values and at `starts` - 1 random ones within the bounds, and follows the best two to their end.
     `progress` gets what is done in words, by default a terminal.
 
@@ -66,7 +71,7 @@ def identify_ode(
     )  # fmt: skip
     matches = determinacy(best, runs)
     result = Identification(
-        model=with_told(
+        model=with_origin(
             best.model, [e.record for e in runs], matches.names, matches.intervals,
             force_scale="given", interrupted=best.interrupted,
         ),
@@ -80,20 +85,20 @@ def identify_ode(
     doubts = (
         *doubts_of(best, matches, outcomes),
         *_of_outputs(result),
-        *told_of_columns(model, runs),
+        *column_notes(model, runs),
     )
     noise = () if best.interrupted else noise_found(best, runs, signals)
     return replace(result, doubts=doubts, notes=(*statement, *notes_of(noise)), noise_kinds=noise)
 
 
 def _of_outputs(identification: Identification) -> list[Note]:
-    """Return which outputs a model misses, and which it does not follow at all."""
+    """Return notes on outputs that exceed the noise, or that the model does not follow."""
     notes, rms = [], identification.rms
     for o in identification.fit.channels:
         left, noise = rms[o.column], identification.noise[o.column]
         parts = [e.measured(o.number)[e.at(o.number)] for e in identification.experiments]
         share = left / float(np.std(np.concatenate(parts)))
-        if noise > 0 and left > MISSED * noise:
+        if noise > 0 and left > EXCESSIVE * noise:
             notes.append(note("output_missed", output=o.column, ratio=left / noise))
         if share > _ALL:
             notes.append(note("output_not_followed", output=o.column, share=share))

@@ -1,4 +1,4 @@
-"""The paper's own identification, section 3: moments of a step, zero crossings of loops.
+"""The paper's identification, section 3: moments of a step, zero crossings of loops.
 
 Source: Yang and Zhu 2015. The linear part comes from the response to a step, eqs. (15) to (21); the
 hysteresis, eqs. (25) to (35), from loops below 1 Hz: zero crossings, then logarithmic least
@@ -35,9 +35,9 @@ from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
 _LEVEL, _RISE = 0.05, 0.05
-#: A turning point stands out by this share of the voltage's range; turns come at even intervals.
+#: The prominence of a turning point over the voltage's range; turns come at even intervals.
 _PROMINENCE, _EVEN = 0.05, 1.2
-#: The mean over this last share of a step response stands for its steady state.
+#: The mean over this last share of a step response is taken for its steady state.
 STEADY_SHARE = 0.05
 #: At the start of a loop the voltage counts as its first value within this share of its range.
 _AT_REST = 1e-3
@@ -47,7 +47,7 @@ _AT_REST = 1e-3
 class Step:
     """The normalised response to one jump of the voltage that is then held.
 
-    `time` (n,) [s] begins at 0 in the middle of the jump, `g` (n,) is (x - x_0)/(x_s - x_0),
+    `time` (n,) [s] is 0 in the middle of the jump, `g` (n,) is (x - x_0)/(x_s - x_0),
     `volts` the height of the jump [V], `k` = (x_s - x_0)/volts [m/V].
     """
 
@@ -82,14 +82,12 @@ def find_steps(records: Sequence[Record]) -> list[Step]:
 
     A step has two levels of voltage and a rise between them that takes less than 5 % of the hold.
     """
-    items = [s for r in records if (s := _step_of(r)) is not None]
-    return sorted(items, key=lambda s: abs(s.volts))
+    return sorted((s for r in records if (s := _step_of(r))), key=lambda s: abs(s.volts))
 
 
 def find_loops(records: Sequence[Record]) -> list[Loop]:
     """Return the records whose voltage goes up and down at even intervals, the slowest first."""
-    items = [loop for r in records if (loop := _loop_of(r)) is not None]
-    return sorted(items, key=lambda loop: loop.frequency)
+    return sorted((loop for r in records if (loop := _loop_of(r))), key=lambda o: o.frequency)
 
 
 def _step_of(record: Record) -> Step | None:
@@ -160,7 +158,7 @@ _OVERSHOOT = 0.01
 def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
     """Return a_1..a_5 [s to s^5], b_1 [s], eq. (15), of one step response, and their doubts.
 
-    They are found by its iterated integrals.
+    They follow from its iterated integrals.
     """
     values = moment_coefficients(step.time, step.g)
     kept = step.time <= (1.0 - _CUT) * step.time[-1]
@@ -178,11 +176,11 @@ def linear_part(step: Step) -> tuple[dict[str, float], list[Note]]:
 
 
 def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
-    """Return a_1..a_5, b_1, shape (6,), of a normalised step response that begins at time 0.
+    """Return a_1..a_5, b_1, shape (6,), of a normalised step response that starts at time 0.
 
     `time` (n,) [s], `g` (n,) [1]; exact only if g is free of noise and the window is endless. By
     K_1..K_6, eqs. (16), (19), with the trapezoidal rule: g_1' = 1 - g,  g_i' = K_(i-1) - g_(i-1),
-    K_i = lim g_i, for which the last sample stands.
+    K_i = lim g_i, for which the last sample is taken.
     """
     width = np.diff(time)
     limit, current, limits = 1.0, g, []
@@ -195,10 +193,10 @@ def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def coefficients_of_limits(limits: FloatArray) -> FloatArray:
-    """Solve eq. (21) for a_1..a_5, b_1, shape (6,), given K_1..K_6.
+    """Solve eq. (21) for a_1..a_5, b_1, shape (6,), from K_1..K_6.
 
     K_1 = a_1 - b_1,  K_i = sum_(j=1..5) (-1)^(j-1) K_(i-j) a_j with K_0 = 1 and K_m = 0 for m < 0.
-    Times are counted in units of |K_1| while solving, which keeps the six equations alike in size.
+    Times are counted in units of |K_1| while solving, so that the six equations have similar sizes.
     """
     unit = abs(float(limits[0])) or 1.0
     k = np.concatenate([[1.0], limits / unit ** np.arange(1, 7)])
@@ -223,21 +221,19 @@ def _reasons(step: Step) -> list[tuple[str, float]]:
     last = max(int(STEADY_SHARE * n), 4)
     drift = abs(float(np.mean(g[-last:]) - np.mean(g[-2 * last : -last])))
     overshoot = float(np.max(g)) - 1.0
-    reasons = []
-    if drift > max(4.0 * noise / np.sqrt(last), 1e-12):
-        reasons.append(("truncated", drift))
-    if noise > 1e-9:
-        reasons.append(("noise", noise))
-    if overshoot > max(_OVERSHOOT, 6.0 * noise):
-        reasons.append(("ringing", 100.0 * overshoot))
-    return reasons
+    reasons = (
+        ("truncated", drift, drift > max(4.0 * noise / np.sqrt(last), 1e-12)),
+        ("noise", noise, noise > 1e-9),
+        ("ringing", 100.0 * overshoot, overshoot > max(_OVERSHOOT, 6.0 * noise)),
+    )
+    return [(name, size) for name, size, counts in reasons if counts]
 
 
 #: What the factors of the denominator stand for.
 _FACTORS = ("tau", "m_P", "c_P", "m_B", "c_B")
 #: A root counts as real where its imaginary part is below this share of its size.
 _REAL = 1e-6
-#: The zero that the factors imply may differ from b_1 by this share before a sentence says so.
+#: The zero that the factors imply may differ from b_1 by this share without a note.
 _ZERO_AGREES = 0.2
 
 
@@ -248,7 +244,7 @@ def mechanics_of(
 
     a_5 s^5 + ... + a_1 s + 1 = (tau s + 1) (m_P/k_P s^2 + c_P/k_P s + 1) (m_B/k_B s^2 + ...).
     A real root gives tau, the other four make two pairs. Where several readings exist (the
-    displacement does not tell them apart, but for the zero) the one is taken whose zero,
+    displacement does not separate them, but for the zero) the one is taken whose zero,
     (c_B + c_P)/(k_B + k_P), comes nearest to b_1, and of those the one with the longest tau. Where
     a pole does not decay, tau = K_1 = a_1 - b_1, the first line of (21), is all that is left.
     """
@@ -262,9 +258,9 @@ def mechanics_of(
         count = int(np.sum(roots.real >= 0.0))
         return alone, (note("growing_poles", count=count),)
     stiffness = np.array([1.0, k_P, k_P, k_B, k_B])
-    items = [dict(zip(_FACTORS, stiffness * f, strict=True)) for f in readings(roots)]
     ranked = []
-    for values in items:
+    for factors in readings(roots):
+        values = dict(zip(_FACTORS, stiffness * factors, strict=True))
         zero = (values["c_B"] + values["c_P"]) / (k_B + k_P)
         off = round(abs(zero - b_1) / max(abs(b_1), 1e-12), 6)
         ranked.append((off, -values["tau"], zero, values))
@@ -303,7 +299,7 @@ _ORDER, _SHORTEST = 3, 5
 #: The window grows until the noise of x' is below this share of the mean speed of the loop,
 #: and to this share of a period at most.
 _QUIET, _LONGEST = 2e-3, 0.1
-#: The noise of x' over what is allowed, beyond which a sentence says so.
+#: The noise of x' over what is allowed, beyond which there is a note.
 _TOO_MUCH = 2.0
 
 
@@ -320,22 +316,14 @@ class Rates(NamedTuple):
     h_rate: FloatArray
     branches: list[tuple[float, slice]]
 
-    @property
-    def inner(self) -> BoolArray:
-        """Marks the samples on branches (n,)."""
-        marked = np.zeros(len(self.u), dtype=np.bool_)
-        for _, branch in self.branches:
-            marked[branch] = True
-        return marked
-
 
 def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
     """Differentiate a loop by Savitzky and Golay's filter of third order.
 
     The window is the shortest odd one with s |c| <= 0.002 * 2 f range(x), where s is the white
     noise of the displacement, c the filter's coefficients, f the loop's frequency; it is a tenth
-    of a period at most, and a sentence says where that is not enough. Voltage and displacement
-    pass through the same filter, so that what it bends it bends alike.
+    of a period at most, with a note if that is not enough. Voltage and displacement pass through
+    the same filter, which distorts both equally.
     """
     period = 1.0 / (loop.frequency * loop.sample_time)
     longest = max(_SHORTEST, int(_LONGEST * period) // 2 * 2 - 1)
@@ -369,7 +357,7 @@ def rates_of(loop: Loop, k: float) -> tuple[Rates, list[Note]]:
 _CLEAR = 0.1
 #: A crossing counts above this share of the largest voltage.
 _NEAR_REST = 0.05
-#: More logarithms of negative numbers than this share are worth a sentence.
+#: More logarithms of negative numbers than this share have a note.
 _FEW = 0.1
 #: Scatter of A_i over the periods, and h at the loop's top, that make k doubtful.
 _SCATTER, _CLOSED = 0.1, 0.3
@@ -385,7 +373,7 @@ class Bends(NamedTuple):
 
 @dataclass(frozen=True)
 class HysteresisPart:
-    """What the loops tell; None where they tell nothing. A alone stands when n, beta, gamma fail.
+    """The hysteresis from the loops; None without any. A remains alone if n, beta, gamma fail.
 
     `A` [m/V] and `delta` [m/(V.s)] are those of eq. (30), `bends` n, beta and gamma (35).
     """
@@ -407,19 +395,19 @@ class _Line(NamedTuple):
 
 
 def hysteresis_part(loops: Sequence[Loop], k: float) -> HysteresisPart:
-    """Return A, delta by eqs. (28) to (30), n, beta, gamma by (31) to (35), given k [m/V].
+    """Return A, delta by eqs. (28) to (30), n, beta, gamma by (31) to (35), at k [m/V].
 
     (34) takes the logarithm of (gamma - beta) h^n. A loop that lags has beta > gamma; then the
-    logarithm of (beta - gamma) h^n is taken, which says the same, and a sentence tells it.
+    logarithm of (beta - gamma) h^n is taken, which is equivalent, with a note.
     """
     differentiated = [rates_of(loop, k) for loop in loops]
     rates = [r for r, _ in differentiated]
-    notes = [note for _, item in differentiated for note in item]
+    notes = [note for _, notes in differentiated for note in notes]
     crossed = [[(sign, _crossing(r, b)) for sign, b in r.branches] for r in rates]
-    pairs = [pair for item in crossed for pair in _periods(item)]
+    pairs = [pair for branches in crossed for pair in _periods(branches)]
     if not pairs:
-        observed = {sign for item in crossed for sign, at in item if at is not None}
-        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in observed]
+        signs = {sign for loop in crossed for sign, at in loop if at is not None}
+        missing = [n for n, sign in (("rising", 1.0), ("falling", -1.0)) if sign not in signs]
         return HysteresisPart(notes=(*notes, note("no_crossing", branches=missing)))
     # eq. (29) less k u': h'_+ = A_i u'_+ + delta_i u_+,  h'_- = A_i u'_- - delta_i u_-
     each = np.array([_solved(up, down) for up, down in pairs])
@@ -455,12 +443,11 @@ def _periods(
     paired with the next rising one.
     """
     pairs = [
-        (first[0], first[1], then[1])
-        for first, then in pairwise(branches)
-        if first[0] * then[0] < 0.0 and first[1] is not None and then[1] is not None
+        (sign, at, then)
+        for (sign, at), (other, then) in pairwise(branches)
+        if sign * other < 0.0 and at is not None and then is not None
     ]
-    up_first = [(first, then) for sign, first, then in pairs if sign > 0.0]
-    return up_first or [(then, first) for _, first, then in pairs]
+    return [p[1:] for p in pairs if p[0] > 0.0] or [p[:0:-1] for p in pairs]
 
 
 def _solved(up: FloatArray, down: FloatArray) -> tuple[float, float]:
@@ -497,8 +484,10 @@ def _logarithms(rates: Sequence[Rates], A: float, delta: float, sign: float) -> 
     """
     h, argument = [np.empty(0)], [np.empty(0)]
     for r in rates:
-        largest = float(np.max(np.abs(r.h[r.inner])))
-        part: BoolArray = r.inner & (r.h > _CLEAR * largest)
+        inner: BoolArray = np.zeros(len(r.u), dtype=np.bool_)
+        for _, branch in r.branches:
+            inner[branch] = True
+        part: BoolArray = inner & (r.h > _CLEAR * float(np.max(np.abs(r.h[inner]))))
         part &= sign * r.u_rate > _CLEAR * float(np.max(np.abs(r.u_rate)))
         h.append(r.h[part])
         argument.append(A - (r.h_rate[part] - sign * delta * r.u[part]) / r.u_rate[part])
@@ -556,9 +545,9 @@ def in_forces(
     coefficients: Mapping[str, float] | None,
     bend: HysteresisPart,
 ) -> tuple[Model, tuple[str, ...], list[Note]]:
-    """Return `start` with everything that was found, k_P and k_B being those of `start`.
+    """Return `start` with all that is identified, k_P and k_B being those of `start`.
 
-    Beside it the names of the parameters that were found, and what could not be taken over.
+    With it the names of the identified parameters, and notes on values out of their bounds.
     k_L = k/C with C = 1/k_P + 1/k_B [m/N]; lag, masses and dampings are factors of the denominator.
     Without a loop f_H is 0; without factors the parts are damped critically, c >= 2 sqrt(k m),
     since nothing is known to ring. A value out of its bounds is refused, n is clipped.
@@ -591,28 +580,28 @@ def in_forces(
             instead = kept.get(name, usual.values[name])
             notes.append(note("out_of_range", name=name, value=value, instead=instead,
                               unit=parameter.unit, low=low, high=high))  # fmt: skip
-    result = tuple(name for name in start.parameter_names if name in kept)
-    return usual.with_values(kept), result, notes
+    names = tuple(name for name in start.parameter_names if name in kept)
+    return usual.with_values(kept), names, notes
 
 
-#: The part of the rising branch, of the largest voltage, whose slope stands in for a step's.
+#: The part of the rising branch, over the largest voltage, whose slope replaces a step's.
 _TIP = (0.8, 0.97)
 
 
 @dataclass(frozen=True, eq=False)
 class PaperIdentification:
-    """What the paper's method finds; None where it finds nothing.
+    """The result of the paper's method; None where it has none.
 
     `coefficients` are a_1 [s] to a_5 [s^5] and b_1 [s] of eq. (15), `k` [m/V] is that of eq. (25).
-    `model` has all in forces; without a loop its f_H is 0, and what else was not found has
+    `model` has all in forces; without a loop its f_H is 0, and what else is not identified has
     ordinary values.
-    `found` names the parameters that the method set; `notes` tell what failed or is doubtful.
+    `identified` names the parameters that the method set; `notes` are what failed or is doubtful.
     """
 
     coefficients: Mapping[str, float] | None
     k: float | None
     model: Model
-    found: tuple[str, ...]
+    identified: tuple[str, ...]
     notes: tuple[Note, ...]
 
     @property
@@ -635,9 +624,9 @@ def paper_method(
     slowest = [loop for loop in loops if loop.frequency < 1.05 * loops[0].frequency]
     k = step.k if step is not None else _slope_at_tip(slowest)
     bend = hysteresis_part(slowest, k) if slowest and k is not None else HysteresisPart()
-    model, result, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
-    output = (*doubts, *conditions(step, slowest, linear), *bend.notes, *notes)
-    return PaperIdentification(linear, k, model, result, output)
+    model, names, notes = in_forces(starting_model(records, stiffness), k, linear, bend)
+    notes = [*doubts, *conditions(step, slowest, linear), *bend.notes, *notes]
+    return PaperIdentification(linear, k, model, names, tuple(notes))
 
 
 def identify_by_paper(
@@ -649,12 +638,12 @@ def identify_by_paper(
     """Return the paper's identification with its residuals on all records, as `identify` does.
 
     Nothing is fitted but each record's memory and offset; so there are no intervals. The warnings
-    are the method's own sentences. Raises InputError, SimulationError.
+    are the method's sentences. Raises InputError, SimulationError.
     """
     progress("moments and zero crossings")
     paper = paper_method(records, stiffness=stiffness)
     experiments = tuple(whole(r) for r in records)
-    sigma, doubts, result = noise_levels(experiments), paper.notes, paper.found
+    sigma, doubts, result = noise_levels(experiments), paper.notes, paper.identified
     progress("the model on all records")
     try:
         best = fit(paper.model, experiments, [], sigma=sigma)
@@ -681,7 +670,7 @@ def identify_by_paper(
 def _slope_at_tip(loops: Sequence[Loop]) -> float | None:
     """Return dx/du near the tip of the widest loop's rising branches [m/V], None without loops.
 
-    Where eq. (8) is saturated, h' = 0 and x' = k u'; so it stands in for the slope of a step.
+    Where eq. (8) is saturated, h' = 0 and x' = k u'; so it replaces the slope of a step.
     """
     if not loops:
         return None

@@ -1,18 +1,19 @@
 """Multiple shooting: records in parts where one simulation of the whole cannot be followed.
 
 What a model misses grows with time where it is unstable or chaotic, and stays where it integrates:
-no fit comes near the data from ordinary starts, and what is missing shows as a drift of its own.
-Each part begins with a state of its own, which is estimated with the parameters (Bock, Recent
+no fit comes near the data from ordinary starts, and what is missing shows as a drift.
+Each part starts with a free state, which is estimated with the parameters (Bock, Recent
 advances in parameter identification techniques for ODE, 1983). Short parts are fitted from several
 starts; then two become one, with the state that the first began with, as long as the model follows
 them. Where it follows the whole records so, they are whole again, from a better start.
 
-An FMU that is run as a whole begins in one state only: of it, records are fitted from their
+An FMU that is run as a whole starts in one state only: of it, records are fitted from their
 beginning on, a part first, and then twice as much. Where the declared values lead to a fit that
 follows the records, no others are tried, as each run is dear.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.inputs import read_like, read_otherwise
 from psa_casadi.identification.multistart import levelled, search_starts
 from psa_casadi.identification.refitting import POLISH, weighted
-from psa_casadi.identification.result import MISSED, StartOutcome
+from psa_casadi.identification.result import EXCESSIVE, StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
 from psa_casadi.progress import Progress, silent
@@ -35,20 +36,20 @@ from psa_casadi.units import FloatArray
 #: A model follows an output where it misses less than this share of its standard deviation; one
 #: that forgets its start is not lost where it comes so near; beyond the last it shows nothing.
 _FOLLOWED, NEAR, _LOST = 0.05, 0.5, 0.7
-#: Samples of a part at least, and parts at most; of what begins once, the first over the whole.
+#: Samples of a part at least, and parts at most; most of a model that starts in one state only.
 _FEWEST, _MOST, _LEAST = 16, 128, 32
 #: Lengths of short parts that are tried, over the shortest.
 _SHORT = (4, 2, 1)
 #: A model forgets where its outputs depend on the first states less than this at the end, over how
 #: they do at the beginning; so large a share of a part is its beginning, and its end.
 _FORGOTTEN, _END = 0.1, 0.1
-#: An error at the beginning of a part grows to so many times its size in it, at most.
+#: Largest growth of an error from the beginning of a part within it.
 _GROWTH = 1000.0
 
-#: The experiments of records in parts of so many samples, or whole.
+#: The experiments of records in parts of a number of samples, or whole (None).
 Made = Callable[[int | None], tuple[Experiment, ...]]
-#: A fit, its experiments, what became of every start, and what is to be said.
-Found = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
+#: A fit, its experiments, the outcome of every start, and notes.
+Fitted = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
 
 
 def ways(
@@ -60,7 +61,7 @@ def ways(
     undecided: bool,
     starts: int,
     progress: Progress = silent,
-) -> Iterator[Found]:
+) -> Iterator[Fitted]:
     """Yield the best fit of whole records, and that of parts where these may be better.
 
     `made` turns the records that were `signals` into experiments, `cut` into parts or not. Where it
@@ -83,7 +84,9 @@ def ways(
         usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
         if usable:
             # what a model lacks may look like a delay of half a sample; the search decides again
-            yield _as_read(best, whole, outcomes, undecided and (follows(best, whole) or not dear))
+            open_hold = undecided and (follows(best, whole) or not dear)
+            fit_read, read, notes = read_otherwise(best, whole, undecided=open_hold)
+            yield fit_read, read, outcomes, notes
         if done:
             return
     progress("fitting parts of the records")
@@ -95,16 +98,8 @@ def ways(
     elif lost is not None:
         raise lost
     elif not usable:
-        yield _as_read(best, whole, outcomes, undecided)
-
-
-def _as_read(
-    best: Fit, whole: tuple[Experiment, ...], outcomes: tuple[StartOutcome, ...], undecided: bool
-) -> Found:
-    if best.interrupted:
-        return best, whole, outcomes, ()
-    best, whole, statement = read_otherwise(best, whole, undecided=undecided)
-    return best, whole, outcomes, statement
+        best, whole, notes = read_otherwise(best, whole, undecided=undecided)
+        yield best, whole, outcomes, notes
 
 
 def _nearer(one: Fit, other: Fit) -> bool:
@@ -116,12 +111,10 @@ def _nearer(one: Fit, other: Fit) -> bool:
 def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
     for o in of.channels:
-        displayed = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
-        noise = np.concatenate(
-            [np.full(len(p), first_order_noise(p)[0]) for p in o.parts if p.size]
-        )
-        least = MISSED * float(np.sqrt(np.mean(noise**2)))
-        if o.rms > max(share * float(np.std(displayed)), least):
+        measured = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
+        noise = np.repeat([first_order_noise(p)[0] if p.size else 0.0 for p in o.parts], o.lengths)
+        least = EXCESSIVE * float(np.sqrt(np.mean(noise**2)))
+        if o.rms > max(share * float(np.std(measured)), least):
             return False
     return True
 
@@ -129,32 +122,28 @@ def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED
 def _in_parts(
     model: Model, signals: Sequence[Signals], made: Made, free: Sequence[str], undecided: bool,
     starts: int, progress: Progress,
-) -> Found | None:  # fmt: skip
+) -> Fitted | None:  # fmt: skip
     """Return the fit of the longest parts that a model follows, or of whole records.
 
-    None where it follows none, and where it forgets how records began: what it misses is told as
-    well of whole ones.
+    None where it follows none, and where it forgets how records started: whole ones then
+    serve as well.
     """
     shortest = _shortest(model, signals, made, free, starts, progress)
     if shortest is None:
         return None
     (best, parts, outcomes), length = shortest
-    best, parts, statement = read_otherwise(best, parts, undecided=undecided)
-    hold = parts[0].record.hold
+    best, parts, notes = read_otherwise(best, parts, undecided=undecided)
+    hold, longest = parts[0].record.hold, max(s.n for s in signals)
     progress("fitting longer parts")
     best, parts, reached = _longest(
-        best,
-        parts,
-        lambda n: read_like(made(n), hold, statement),
-        length,
-        max(s.n for s in signals),
+        best, parts, lambda n: read_like(made(n), hold, notes), length, longest
     )
     if reached is not None:
         if begins_once(model) or forgets(best, parts):
             return None
         lasts = reached * float(np.median([s.sample_time for s in signals]))
-        statement = (*statement, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
-    return *levelled(best, parts), outcomes, statement
+        notes = (*notes, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
+    return *levelled(best, parts), outcomes, notes
 
 
 def _shortest(
@@ -190,7 +179,7 @@ def _longest(
         double = 2 * reached if 4 * reached <= longest else None
         longer = made(double)
         try:
-            again = begun(best, parts, longer)
+            again = fit_longer_parts(best, parts, longer)
         except PsaError:
             break
         if again.interrupted or not follows(again, longer) or _grows(again, longer):
@@ -205,9 +194,9 @@ def begins_once(model: Model) -> bool:
 
 
 def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Signals]:
-    """Return records in parts of so many samples, the last one of up to half of them more.
+    """Return records in parts of `length` samples, the last one of up to half of them more.
 
-    Only the first part of each for a model that begins once.
+    Only the first part of each for a model that starts in one state only.
     """
     if length is None:
         return list(signals)
@@ -215,15 +204,14 @@ def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Si
         return [s.slice(0, min(length, s.n)) for s in signals]
     result = []
     for s in signals:
-        items = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2]
-        ends = [*items[1:], s.n]
-        result += [s.slice(a, b) for a, b in zip(items, ends, strict=True)] if ends[1:] else [s]
+        edges = [a for a in range(0, s.n, length) if not a or a <= s.n - length // 2] + [s.n]
+        result += [s.slice(a, b) for a, b in pairwise(edges)] if edges[2:] else [s]
     return result
 
 
-def begun(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
-    """Fit longer parts from where a fit of shorter ones stands. Raises SimulationError."""
-    known = {_place(e): item for e, item in zip(parts, of.starts(), strict=True)}
+def fit_longer_parts(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
+    """Fit longer parts from the end of a fit of shorter ones. Raises SimulationError."""
+    known = {_place(e): start for e, start in zip(parts, of.starts(), strict=True)}
     starts: list[Mapping[str, float]] = [known.get(_place(e), {}) for e in longer]
     sigma = [of.sigma[0]] * len(longer)
     return fit(
@@ -243,8 +231,8 @@ def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
     it, and in its last tenth.
     """
     for k, p in enumerate(of.predictions(parts, further=True)):
-        item = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
-        each = [p.further[o.channel.outputs[0]][1][:, item] for o in of.channels]
+        starts = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
+        each = [p.further[o.channel.outputs[0]][1][:, starts] for o in of.channels]
         size = np.max(np.abs(each), axis=2, initial=0.0)
         n = max(1, int(_END * size.shape[1]))
         spans = size[:, :n], size, size[:, -n:]
@@ -270,6 +258,6 @@ def forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
     """
     left = dict[str, float]()
     for e, (first, _, last) in zip(parts, _influences(of, parts), strict=True):
-        item = float(np.log(np.max(last / first)))
-        left[e.record.sha256] = left.get(e.record.sha256, 0.0) + item
+        change = float(np.log(np.max(last / first)))
+        left[e.record.sha256] = left.get(e.record.sha256, 0.0) + change
     return max(left.values()) < float(np.log(_FORGOTTEN))

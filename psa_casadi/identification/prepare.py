@@ -21,7 +21,7 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import MOST, Channel, Experiment
 from psa_casadi.records.suspects import cleaned, suspects
 
-#: The columns of a stack that are fitted beside its displacement, by name. The charge on a stack is
+#: The columns of a stack that are fitted with its displacement, by name. The charge on a stack is
 #: that of its capacitance and, by reciprocity, a share of the displacement; the current is its
 #: rate, which lags faster than the sampling move most.
 COLUMNS: Mapping[str, Channel] = {
@@ -59,7 +59,7 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
 
 
 def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
-    """Return records with block averages where these lose nothing, and notes that tell it.
+    """Return records with block averages where these lose nothing, and notes on it.
 
     As they are where all of their samples can be fitted.
     """
@@ -70,7 +70,7 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
 
 
 def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
-    """Return a record of block averages, where they lose nothing, and a note that tells it."""
+    """Return a record of block averages, where they lose nothing, and a note on it."""
     y = measured(record)
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([record])
     if noise <= 0 or slope == 0:
@@ -81,7 +81,7 @@ def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
     return shorter, (note("averaged", record=record.name, samples=record.n, block=factor),)
 
 
-#: Noise level of a column before a fit has told it, over the standard deviation of the column.
+#: Noise level of a column before a fit, over the standard deviation of the column.
 _FIRST_LEVEL = 1e-2
 
 
@@ -95,7 +95,7 @@ class Columns:
 
 
 def columns_of(model: Model, records: Sequence[Record]) -> Columns:
-    """Return the further columns to fit. A column that says nothing of a stack is left out.
+    """Return the further columns to fit. A column that does not depend on a stack is left out.
 
     Raises InputError for a column that the model cannot give, or that has samples missing.
     """
@@ -114,7 +114,7 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
                 f"The records have the column '{column}', but the model '{model.name}' does not"
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
-        elif why := _says_nothing(column, items):
+        elif why := _useless(column, items):
             statement.append(note(why, column=column))
         else:
             model = wider
@@ -140,7 +140,7 @@ def with_levels(
     return tuple(e.with_further(levels) for e in experiments)
 
 
-def _says_nothing(column: str, records: Sequence[Record]) -> str:
+def _useless(column: str, records: Sequence[Record]) -> str:
     """Return why a column is no use, as the code of a note, "" where it is."""
     if all(float(np.ptp(getattr(r, column))) == 0.0 for r in records):
         return "still_column"

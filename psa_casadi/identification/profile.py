@@ -138,8 +138,8 @@ class Profile:
     `values` (points,) ascend, in `unit`; `increase` (points,) is that of the cost over its minimum,
     in units of the residuals' variance: `PROFILE_LIMIT` bounds the 95 % interval [`low`, `high`].
     An end is None where the increase stays below the limit up to `bounds`, or as far as the model
-    can be simulated. `standard_error` is the one of the linearised fit, for comparison; `log` says
-    that the parameter is searched on a logarithmic scale.
+    can be simulated. `standard_error` is the one of the linearised fit, for comparison; `log`:
+    the parameter is searched on a logarithmic scale.
     """
 
     name: str
@@ -168,7 +168,7 @@ def profile(
     The parameter is held on a grid that grows outwards until the limit is crossed; every point is
     fitted from its neighbours. The limit on the cost is 3.84 times the ratio of the parameter's
     variance (`covariance_of`, residuals as they are) to that of white residuals at the level that
-    weighted them, so that a quadratic cost gives the linearised interval. The parameter's own
+    weighted them, so that a quadratic cost gives the linearised interval. The parameter's
     weak prior does not count. Raises InputError for a parameter that was not free.
 
     Source: Murphy and van der Vaart 2000 (profile likelihood); Chandler and Bate 2007 (its vertical
@@ -236,6 +236,6 @@ def _spread(best: Fit, experiments: Sequence[Experiment], name: str) -> tuple[fl
         for w in (True, False)
     )
     result = max(coloured, 1e-12 * white)
-    # a parameter that the prior holds has no ratio of its own: the residuals' variance stands in
+    # a parameter that the prior holds has no ratio: the residuals' variance takes its place
     rows = np.concatenate([residuals for _, residuals in weighted_rows(best, experiments)])
     return float(np.sqrt(result)), max(result / white, float(np.mean(rows**2)))

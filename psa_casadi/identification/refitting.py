@@ -23,7 +23,7 @@ _QUICK_RTOL, _OF_NOISE = 1e-4, 0.02
 _LEVEL_ROUNDS, _ALL_ROUNDS, _SAME_LEVEL = 2, 4, 0.02
 #: Fits whose costs differ by less, in units of the log-likelihood's double, are equally good.
 _EQUAL = 3.84
-#: ... or by less than this share of what the model's own error adds to the cost.
+#: ... or by less than this share of what the model's error adds to the cost.
 _OF_EXCESS = 0.05
 #: ... and they differ where a parameter is this many standard errors apart.
 _APART = 4.0
@@ -78,7 +78,7 @@ def refit(
     evaluations: int | None = None,
     tolerance: float = 1e-5,
 ) -> Fit:
-    """Continue a fit from where it stands, of the same parameters unless others are `free`.
+    """Continue a fit from its end, of the same parameters unless others are `free`.
 
     Without `sigma` the noise levels are those that its residuals suggest. It may end early where
     the rms will stay above `least`, in the unit of the first output.
@@ -103,14 +103,14 @@ def relevelled(
 ) -> tuple[Fit, tuple[Experiment, ...]]:
     """Fit again with what the fit leaves of every further channel as its noise level.
 
-    And of the first one where it is asked of `every` channel, until the levels stay the same. As it
-    is where there is no such channel, and where a fit was interrupted.
+    With `every`, of the first one too, until the levels stay the same. The fit itself if there is
+    no such channel, or it was interrupted.
     """
     now, rounds = tuple(experiments), _ALL_ROUNDS if every else _LEVEL_ROUNDS
     for _ in range(rounds if best.further else int(every)):
-        output = best.channels if every else best.further
-        levels = [f.relevelled() for f in output]
-        pairs = zip(output, levels, strict=True)
+        channels = best.channels if every else best.further
+        levels = [f.relevelled() for f in channels]
+        pairs = zip(channels, levels, strict=True)
         same = all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs)
         if best.interrupted or same:
             break
@@ -125,33 +125,34 @@ def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]
     return [e.with_further(f.channel for f in before.further) for e in experiments]
 
 
-#: Noise is estimated from so many samples or more, and differs from so many standard errors on.
-_TELLING, _SURE = 32, 3.0
+#: Fewest samples for an estimate of noise, and standard errors from which on noise differs.
+_FEWEST, _SURE = 32, 3.0
 
 
 def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
-    """Return the experiments with their shares of the noise, as the fast parts of residuals tell.
+    """Return the experiments with their shares of the noise, from the fast parts of residuals.
 
     Of every output, over the usual one of all experiments (the geometric mean by samples). A share
-    that cannot be told from 1 is 1. Of an experiment that is held out whole, its beginning tells.
+    that does not differ from 1 is 1. Of an experiment that is held out whole, its first tenth
+    counts.
     """
     shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
     whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
-    displayed = fit.shown(experiments) if whole else []
+    predicted = fit.predicted_channels(experiments) if whole else []
     for o in fit.channels:
         j = o.number
-        rows = ((k, experiments[k], displayed[k][:, j]) for k in whole)
+        rows = ((k, experiments[k], predicted[k][:, j]) for k in whole)
         started = ((k, e.errors(j, y)[e.at(j, e.known)]) for k, e, y in rows)
         fitted = zip(o.records, o.parts, strict=True)
-        items = [(k, p) for k, p in (*fitted, *started) if len(p) >= _TELLING]
-        if len(items) < 2:
+        parts = [(k, p) for k, p in (*fitted, *started) if len(p) >= _FEWEST]
+        if len(parts) < 2:
             continue
-        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in items]
-        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in items])
-        for (k, part), item in zip(items, over, strict=True):
-            if abs(item) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
-                shares[k][j] *= float(np.exp(item))
-    return tuple(replace(e, noise=tuple(item)) for e, item in zip(experiments, shares, strict=True))
+        noise = [max(first_order_noise(p)[0], o.straight, 1e-300) for _, p in parts]
+        over = np.log(noise) - np.average(np.log(noise), weights=[len(p) for _, p in parts])
+        for (k, part), ratio in zip(parts, over, strict=True):
+            if abs(ratio) > 0.5 * _SURE * uncertain(part):  # half of the power's error is the rms's
+                shares[k][j] *= float(np.exp(ratio))
+    return tuple(replace(e, noise=tuple(s)) for e, s in zip(experiments, shares, strict=True))
 
 
 def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> bool:
@@ -211,8 +212,8 @@ def quick_from(
 def equal(one: Fit, other: Fit) -> bool:
     """Whether two fits are equally likely.
 
-    Beyond the noise, what the model lacks is in both costs; a gain of a small share of that says
-    more about the lack than about the parameters.
+    Beyond the noise, what the model lacks is in both costs; a gain of a small share of that is
+    due to the lack rather than to the parameters.
     """
     count = max(len(one.residuals), 1)
     excess = max(min(one.data_cost, other.data_cost) - count, 0.0)

@@ -11,18 +11,20 @@ from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
-from psa_casadi.records.noise import first_order_noise
-from psa_casadi.records.noise_kinds import NoiseFound
+from psa_casadi.records.noise import first_order_noise, runs_of
+from psa_casadi.records.noise_kinds import NoiseFound, noise_kinds
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment, noise_share
+from psa_casadi.records.suspects import SPIKE
 from psa_casadi.shown import Reported, frame, made
 from psa_casadi.strict_json import json_text
+from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import Interval, Provenance
 from psa_casadi.version import __version__
 
-#: A residual above so many times its own fast noise shows that the model misses something.
-MISSED = 1.5
+#: A residual above this multiple of its fast noise shows that the model lacks something.
+EXCESSIVE = 1.5
 
 
 @dataclass(frozen=True)
@@ -44,9 +46,9 @@ class StartOutcome:
 class Identification(Reported):
     """An identified model with the fit behind it, what the data determine, and doubts.
 
-    `starts` tells what became of every start of the search; `notes` what was done to the records
+    `starts` are the outcomes of all starts of the search; `notes` what was done to the records
     (samples masked, averaged), which is no doubt. `warnings` and `sentences` are both in words.
-    `interrupted` says that a keyboard interrupt ended the search, or what came after it.
+    `interrupted`: a keyboard interrupt ended the search, or what came after it.
     `noise_kinds` are those of every output of every record; `notes` say what to do about them.
     """
 
@@ -71,7 +73,7 @@ class Identification(Reported):
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was done to the records and found in them, in words."""
+        """What was done to the records, and their noise, in words."""
         return texts(self.notes)
 
     @property
@@ -87,7 +89,7 @@ class Identification(Reported):
     @cached_property
     def rms(self) -> Mapping[str, float]:
         """What is left of every measured output over all records (rms), in its unit."""
-        return rms_left(self.fit, self.experiments)
+        return residual_rms(self.fit, self.experiments)
 
     @cached_property
     def noise(self) -> Mapping[str, float]:
@@ -127,7 +129,7 @@ class Identification(Reported):
         return json_text(self.to_dict())
 
 
-def rms_left(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+def residual_rms(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
     """Return what a fit leaves of every measured output over all records (rms), in its unit."""
     table = {}
     for o in fit.channels:
@@ -159,14 +161,14 @@ def doubts_of(
     return [*items, note("undetermined", names=alone)] if alone else items
 
 
-def with_told(
+def with_origin(
     model: Model,
     records: Sequence[Record | Signals],
     free: Sequence[str],
     intervals: Mapping[str, Interval],
     **more: Any,
 ) -> Model:
-    """Return a fitted model that says from which records it comes and how sure its values are.
+    """Return a fitted model with its records and the intervals of its values as its provenance.
 
     `more` are other fields of `Provenance` by name.
     """
@@ -178,3 +180,53 @@ def with_told(
         **more,
     )
     return replace(model, provenance=provenance, evidence=None)
+
+
+def noise_found(
+    fit: Fit, experiments: Sequence[Experiment], arguments: Sequence[Record | Signals] = ()
+) -> tuple[NoiseFound, ...]:
+    """Return the kinds of noise in every output of every record, fitted and held-out samples.
+
+    The noise is that of the samples as they were measured, not of averages or without outliers; the
+    prediction is a straight line between those of the experiments' samples. The model is simulated
+    once more. Raises SimulationError where it cannot be.
+    """
+    result = list[NoiseFound]()
+    for e, predicted in zip(experiments, fit.predicted_channels(experiments), strict=True):
+        times = e.record.time
+        whole = next((r for r in arguments if _holds(r, e)), e.record)
+        inside = (whole.time >= times[0]) & (whole.time <= times[-1])
+        time = whole.time[inside]
+        named = [c for n in fit.model.input_names if (c := whole.column(n)) is not None]
+        moving = [u[inside] for u in named if np.isfinite(u).all() and np.ptp(u[inside]) > 0.0]
+        near = np.searchsorted(0.5 * (times[1:] + times[:-1]), time)
+        for j, channel in enumerate(e.channels):
+            reading = whole.column(channel.column)
+            if reading is None or not np.isfinite(predicted[:, j]).any():
+                continue
+            y = np.interp(time, times, predicted[:, j])
+            inputs = sorted(moving, key=lambda u: -_correlation(u, y))
+            used = _used(e, j)[near]
+            kinds = noise_kinds(time, reading[inside], y, inputs, used)
+            result.append(NoiseFound(e.record.name, channel.column, channel.unit, kinds))
+    return tuple(result)
+
+
+def _holds(record: Record | Signals, e: Experiment) -> bool:
+    """Whether an experiment's record was made of a record: of its file, within its time."""
+    starts, ends = e.record.time[0], e.record.time[-1]
+    within = record.time[0] <= starts and ends <= record.time[-1]
+    return bool(record.sha256 == e.record.sha256 and within)
+
+
+def _used(e: Experiment, channel: int) -> BoolArray:
+    """Return the samples (n,) that are fitted or judged, and outliers that are masked there."""
+    used = e.at(channel, e.used | e.held_out)
+    for start, stop in runs_of(~used):
+        used[start:stop] = stop - start <= SPIKE
+    return used
+
+
+def _correlation(u: FloatArray, y: FloatArray) -> float:
+    """Return the size of the correlation of an input with an output (n,), 0 where there is none."""
+    return abs(float(np.corrcoef(u, y)[0, 1])) if np.ptp(y) > 0.0 and np.ptp(u) > 0.0 else 0.0

@@ -4,7 +4,7 @@ The noise of an input moves the model, so that a fit prefers whatever explains t
 without that input. A load that is a function of the displacement is known better by its curve over
 the displacement that a model without it predicts from the voltage: an instrument whose error has
 nothing to do with the load cell's (instrumental variables; Fuller, Measurement Error Models 1987).
-A straight line is what a stiffer stack does: it tells nothing of the stiffness that it meets.
+A straight line is what a stiffer stack does: it does not determine the stiffness that it meets.
 Where the displacement's sensor bends, that model is bent with it, and the load may be a straighter
 curve over what the same model predicts that is fitted to the load itself.
 """
@@ -18,9 +18,8 @@ import numpy as np
 
 from psa_casadi.components.stack import MEMORY_SPECTRUM
 from psa_casadi.errors import PsaError
-from psa_casadi.identification.exchanges import exchanged, with_fast, without_blur
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.force_start import retuned
+from psa_casadi.identification.mechanics import exchanged, retuned, with_fast, without_blur
 from psa_casadi.identification.multistart import fits_from
 from psa_casadi.identification.refitting import (
     differing,
@@ -58,7 +57,7 @@ CORE = (
 _QUICK, _FINALISTS, _FIRST = 12, 3, 5
 #: The second best is followed to the end where its cost is at most this much larger.
 _NEAR = 1.5
-#: A fit misses the records where its mean weighted square exceeds this; so many starts are then
+#: A fit lacks something if its mean weighted square exceeds this; this many starts are then
 #: followed to the end.
 _MISSED, _FOLLOWED = 2.0, 4
 #: A start whose quick fit comes this close to the best one's cost is followed to the end.
@@ -67,7 +66,7 @@ _CLOSE = 1.02
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """The best fit, what became of every start, and parameters that equally good fits differ in."""
+    """The best fit, the outcome of every start, and parameters in which equal fits differ."""
 
     best: Fit
     starts: tuple[StartOutcome, ...]
@@ -75,9 +74,9 @@ class Search:
 
 
 def free_parameters(model: Model, records: Sequence[Record] = ()) -> list[str]:
-    """Return the core parameters and those of the model's effects that records can tell.
+    """Return the core parameters and those of the model's effects that records determine.
 
-    A measured load that changes tells the stiffness that it meets.
+    A measured load that changes determines the stiffness that it meets.
     """
     effects = [n for c in model.effects for n in c.fitted]
     loaded = "load_force" in model.input_names and any(
@@ -103,14 +102,14 @@ def search(
     thorough: bool = False,
     progress: Progress = silent,
 ) -> Search:
-    """Fit the core parameters from several starts, then whatever else the data can tell.
+    """Fit the core parameters from several starts, then whatever else the data determine.
 
     The starts are the records' loops and ordinary shapes with the first of the `linear` candidates
     (lags and resonances), and the other candidates with the first loop. Each gets a quick fit; the
     best and the second best are followed to the end, if that one is close or, with `thorough`, not
-    far, to tell whether starts agree; with `thorough` more of them while all miss the records. A
-    keyboard interrupt ends the search at the best fit so far, if there is one. Raises PsaError when
-    no start can be simulated.
+    far, to see whether starts agree; with `thorough` more of them while all leave more than the
+    noise. A keyboard interrupt ends the search at the best fit so far, if there is one. Raises
+    PsaError when no start can be simulated.
     """
     so_far: list[Fit] = []
     off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)
@@ -131,38 +130,38 @@ def _search(
     progress: Progress,
     keep: Callable[[Fit], None],
 ) -> Search:
-    """Search as `search` says; `keep` gets every fit that is better than those before it."""
+    """Search as `search` does; `keep` gets every fit that is better than those before it."""
     records = [e.record for e in fitted(experiments)]
     core = free_parameters(model, records)
-    output = resolved(model, linear, min(r.sample_time for r in records))
+    mechanics = resolved(model, linear, min(r.sample_time for r in records))
     starts = starting_points(model, linear, records)
-    result = _quick_fits(model, experiments, [*core, *output], starts, progress, keep)
-    keep(result[0][1])
-    sigma = residual_noise(result[0][1], experiments)
+    ranked = _quick_fits(model, experiments, [*core, *mechanics], starts, progress, keep)
+    first = ranked[0][1]
+    keep(first)
+    sigma = residual_noise(first, experiments)
     polished: list[Fit] = []
-    for name, quick in result:
-        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * result[0][1].data_cost
+    for name, quick in ranked:
+        near = quick.data_cost < (_NEAR if thorough else _CLOSE) * first.data_cost
         lost = all(f.data_cost > _MISSED * len(f.residuals) for f in polished)
         misfit = thorough and len(polished) < _FOLLOWED and lost
         if polished and (polished[0].interrupted or not (misfit or (near and len(polished) < 2))):
             break
-        if polished and not thorough and same_place(result[0][1], quick, experiments):
+        if polished and not thorough and same_place(first, quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
         polished.append(ended)
         keep(min(polished, key=lambda f: f.data_cost))
-    best = min(polished, key=lambda f: f.data_cost)
-    outcomes, not_unique = _outcomes(result, polished, best, experiments)
+    top = best = min(polished, key=lambda f: f.data_cost)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
-        tuned = retuned(best, experiments, progress) if output else best
+        tuned = retuned(best, experiments, progress) if mechanics else best
         if tuned is not best:
-            best = tuned
-            outcomes, not_unique = _outcomes(result, polished, best, experiments)
+            top = best = tuned
         keep(best)
         best = without_blur(best, experiments)
         keep(best)
+    outcomes, not_unique = _outcomes(ranked, polished, top, experiments)
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, experiments, progress)
         not_unique |= set(open_ones)
@@ -171,14 +170,14 @@ def _search(
 
 
 def _outcomes(
-    result: Sequence[tuple[str, Fit]],
+    ranked: Sequence[tuple[str, Fit]],
     polished: Sequence[Fit],
     best: Fit,
     experiments: Sequence[Experiment],
 ) -> tuple[tuple[StartOutcome, ...], set[str]]:
-    """Tell what became of every start, and which parameters equally good fits differ in."""
+    """Return the outcome of every start, and the parameters in which equally good fits differ."""
     outcomes, not_unique = [], set[str]()
-    for k, (name, quick) in enumerate(result):
+    for k, (name, quick) in enumerate(ranked):
         if k >= len(polished):
             outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
@@ -203,18 +202,18 @@ def _quick_fits(
     quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
     rounds: tuple[int, ...] = (_QUICK,) if len(starts) <= _FINALISTS else (_FIRST, _QUICK - _FIRST)
 
-    def begun(name: str, start: Mapping[str, float]) -> Fit:
+    def quick_fit(name: str, start: Mapping[str, float]) -> Fit:
         progress(f"base fit from {name}")
         return fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
 
-    items = sorted(fits_from(starts, begun), key=lambda pair: pair[1].data_cost)
-    for _, best in items[:1]:
+    fits = sorted(fits_from(starts, quick_fit), key=lambda pair: pair[1].data_cost)
+    for _, best in fits[:1]:
         keep(best)
     widest = max(e.record.range_m for e in fitted(experiments))
     # a loop that diverges is left there, unless all do
-    items = [pair for pair in items if pair[1].rms < widest] or items
-    for k, (name, quick) in enumerate(items[: _FINALISTS if len(rounds) > 1 else 0]):
-        if any(f.interrupted for _, f in items):
+    fits = [pair for pair in fits if pair[1].rms < widest] or fits
+    for k, (name, quick) in enumerate(fits[: _FINALISTS if len(rounds) > 1 else 0]):
+        if any(f.interrupted for _, f in fits):
             break
         progress(f"base fit from {name}, continued")
         states = quick.starts()
@@ -223,13 +222,13 @@ def _quick_fits(
                 quick.model, experiments, free, start_states=states, evaluations=rounds[1],
                 **quickly,
             )  # fmt: skip
-            items[k] = (name, further)
-    if not items:
+            fits[k] = (name, further)
+    if not fits:
         raise PsaError(
             "The base model could not be simulated from any start; the voltage's unit or the"
             " displacement's sign is the likely cause: check the record."
         )
-    return sorted(items, key=lambda pair: pair[1].data_cost)
+    return sorted(fits, key=lambda pair: pair[1].data_cost)
 
 
 _LABELS = {FORMS["bouc-wen"].name: "Bouc-Wen", FORMS["spectrum"].name: "a spectrum of elements"}
@@ -276,14 +275,14 @@ def search_forms(
         next(_LABELS[c.name] for c in s.best.model.components if c.name in _LABELS) for s in ranked
     ]
     left, other_left = (1e9 * s.best.rms for s in ranked)
-    statement = note("form", better=forms[0], left=left, other=forms[1], other_left=other_left)
-    return ranked[0], statement
+    why = note("form", better=forms[0], left=left, other=forms[1], other_left=other_left)
+    return ranked[0], why
 
 
 #: The column, and the highest order of the curve.
 LOAD, _ORDER = "load_force", 8
-#: The curve stands for the load where it misses no more than its noise, with this margin, and this
-#: share of its range.
+#: The curve replaces the load if the rms difference is no more than the noise, with this margin,
+#: and this share of the range.
 _NOISE, _SHARE = 1.1, 1e-3
 
 
@@ -294,15 +293,11 @@ def is_measured(experiments: Sequence[Experiment]) -> bool:
 
 def without_column(experiments: Sequence[Experiment], column: str) -> tuple[Experiment, ...]:
     """Return the experiments as if a column had not been measured."""
-    gone: dict[str, Any] = {column: None}
-    return tuple(
-        replace(
-            e,
-            record=replace(e.record, **gone),
-            channels=tuple(q for q in e.channels if q.column != column),
-        )
-        for e in experiments
-    )
+    result, gone = [], dict[str, Any]({column: None})
+    for e in experiments:
+        channels = tuple(c for c in e.channels if c.column != column)
+        result.append(replace(e, record=replace(e.record, **gone), channels=channels))
+    return tuple(result)
 
 
 def loads_as_curves(
@@ -311,7 +306,7 @@ def loads_as_curves(
     """Return the experiments with loads that are curves over the displacement as these curves.
 
     Of a fit without the load, from `start`. Where all of them are straight lines they are 0: the
-    model's stiffness stands for them. Other loads stay as they were measured. Without a load that
+    model's stiffness replaces them. Other loads stay as they were measured. Without a load that
     changes nothing is fitted.
     """
     loads = [np.asarray(e.record.load_force, dtype=float) for e in experiments]
@@ -322,30 +317,30 @@ def loads_as_curves(
     as_displacement = []  # the load, to the size and sign of the displacement
     for e, load in zip(experiments, loads, strict=True):
         y = np.asarray(e.record.displacement)
-        observed, span = np.isfinite(y), max(float(np.ptp(load)), 1e-300)
-        sign = np.sign(np.cov(load[observed], y[observed])[0, 1]) or 1.0
-        text = np.where(observed, load * sign * e.record.range_m / span, np.nan)
-        record = replace(e.record, displacement=text, load_force=None)
+        valid, span = np.isfinite(y), max(float(np.ptp(load)), 1e-300)
+        sign = np.sign(np.cov(load[valid], y[valid])[0, 1]) or 1.0
+        scaled = np.where(valid, load * sign * e.record.range_m / span, np.nan)
+        record = replace(e.record, displacement=scaled, load_force=None)
         as_displacement.append(replace(e, record=record).with_further(()))
-    ways = [
-        fit_base(start, item, progress=progress).predicted(item)
-        for item in (unloaded, tuple(as_displacement))
+    predictions = [
+        fit_base(start, others, progress=progress).predicted(others)
+        for others in (unloaded, tuple(as_displacement))
     ]
-    curves = [_curve(load, item) for load, *item in zip(loads, *ways, strict=True)]
+    curves = [_curve(load, x) for load, *x in zip(loads, *predictions, strict=True)]
     straight = all(c is not None and c[1] == 1 for c in curves)
-    items = []
-    for e, load, item in zip(experiments, loads, curves, strict=True):
-        curve = np.zeros(e.record.n) if straight else load if item is None else item[0]
-        items.append(replace(e, record=replace(e.record, load_force=curve)))
-    return tuple(items)
+    result = []
+    for e, load, c in zip(experiments, loads, curves, strict=True):
+        curve = np.zeros(e.record.n) if straight else load if c is None else c[0]
+        result.append(replace(e, record=replace(e.record, load_force=curve)))
+    return tuple(result)
 
 
 def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, int] | None:
-    """Return the polynomial that stands for a load (n,) [N], and its order; None if all are far.
+    """Return the polynomial that replaces a load (n,) [N], and its order; None if all are far.
 
     Over one of the displacements x (n,) [m]; of the smallest n ln S + order ln n (Schwarz 1978).
     """
-    items = []
+    fits = []
     for x in ways:
         middle, half = 0.5 * (float(x.max()) + float(x.min())), 0.5 * float(np.ptp(x))
         powers = np.polynomial.chebyshev.chebvander((x - middle) / max(half, 1e-300), _ORDER)
@@ -353,8 +348,8 @@ def _curve(load: FloatArray, ways: Sequence[FloatArray]) -> tuple[FloatArray, in
             columns = powers[:, : order + 1]
             curve = columns @ np.linalg.lstsq(columns, load, rcond=None)[0]
             left = max(float(np.sum((load - curve) ** 2)), 1e-300)
-            items.append((load.size * np.log(left) + order * np.log(load.size), order, curve))
-    _, order, curve = min(items, key=lambda f: f[0])
+            fits.append((load.size * np.log(left) + order * np.log(load.size), order, curve))
+    _, order, curve = min(fits, key=lambda f: f[0])
     misfit = float(np.std(load - curve))
     allowed = np.hypot(_NOISE * high_frequency_noise(load), _SHARE * float(np.ptp(load)))
     return (curve, order) if misfit <= allowed else None

@@ -17,16 +17,16 @@ NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
-class Found:
-    """A parameter of one device in its SI unit: value, 95 % interval, and whether it is told.
+class Estimate:
+    """A parameter of one device in its SI unit: value and 95 % interval.
 
-    `told` is False where the records do not determine the parameter or it sits on a bound.
+    `determined` is False if the records do not determine the parameter or it sits on a bound.
     """
 
     value: float
     unit: str
     interval: tuple[float, float] | None
-    told: bool = True
+    determined: bool = True
     meaning: str = ""
 
 
@@ -53,13 +53,12 @@ class BudgetShare:
 class HeldOutErrors:
     """Held-out rms of an output in its unit: base and extended model, and the noise.
 
-    Of a stack's displacement both models' in % of the range, too.
+    Of a stack's displacement the extended model's in % of the range, too.
     """
 
     base: float
     extended: float
     noise: float
-    base_percent: float | None = None
     extended_percent: float | None = None
     output: str = "displacement"
     unit: str = "m"
@@ -67,7 +66,7 @@ class HeldOutErrors:
 
 @dataclass(frozen=True)
 class Trace:
-    """The first part of a record beside its model: (n,) in SI units, nan where not measured."""
+    """The first part of a record and its model: (n,) in SI units, nan where not measured."""
 
     record: str
     time: tuple[float, ...]
@@ -78,17 +77,17 @@ class Trace:
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found of one device.
+    """The result for one device.
 
-    `kind` is what found it. `rms_m` and `rms_percent` are the fit's error over its samples, [m] and
-    in % of the range, where an identification told them; `warnings` are its doubts in words, and
-    `missed` is by how many times their noise it misses its records, None where it does not.
-    `records` are the names and SHA-256 of the files. What a file does not hold is empty or None.
+    `kind` is that of the result. `rms_m` and `rms_percent` are the rms residual of an
+    identification, [m] and in % of the range; `warnings` are its doubts in words, and `noise_ratio`
+    is the residual over the noise, None where the fit reaches the noise. `records` are the names
+    and SHA-256 of the files. What a file does not hold is empty or None.
     """
 
     device: str
     kind: Literal["identification", "diagnosis", "model"]
-    parameters: Mapping[str, Found] = field(default_factory=dict)
+    parameters: Mapping[str, Estimate] = field(default_factory=dict)
     records: tuple[tuple[str, str], ...] = ()
     batch: str = ""
     day: date | None = None
@@ -103,31 +102,25 @@ class Finding:
     trace: Trace | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    missed: float | None = None
+    noise_ratio: float | None = None
 
 
 def replayed(model: Model) -> Trace | None:
-    """Return the first part of the record beside the model with the sensor's offset, else None.
+    """Return the first part of the record and the model with the sensor's offset, else None.
 
     Raises SimulationError.
     """
-    result = model.evidence.reference if model.evidence else None
-    if model.evidence is None or result is None or "voltage" not in result.inputs:
+    part = model.evidence.reference if model.evidence else None
+    if model.evidence is None or part is None or "voltage" not in part.inputs:
         return None
-    known = model.evidence.run_of(result.record)
-    time = np.array(result.time)
-    inputs = {n: np.array(v) for n, v in result.inputs.items() if n in model.input_names}
+    known = model.evidence.run_of(part.record)
+    start, offset = (known.start, known.offset_m) if known is not None else ({}, 0.0)
+    time = np.array(part.time)
+    inputs = {n: np.array(v) for n, v in part.inputs.items() if n in model.input_names}
     u = input_samples(model, time.size, inputs)
-    start = known.start if known is not None else {}
     x0 = np.array([start.get(s.name, s.start) for s in model.structure.states])
-    shows = model.output_names.index(output_of(model) or "displacement")  # with the sensor's errors
-    y = run(model, time, u, x0, rtol=1e-6).y[:, shows]
-    offset = known.offset_m if known is not None else 0.0
-    displayed = tuple(math.nan if v is None else v for v in result.displacement)
-    return Trace(
-        result.record,
-        result.time,
-        result.inputs["voltage"],
-        displayed,
-        tuple((y + offset).tolist()),
-    )
+    sensor = model.output_names.index(output_of(model) or "displacement")  # with its errors
+    y = run(model, time, u, x0, rtol=1e-6).y[:, sensor]
+    measured = tuple(math.nan if v is None else v for v in part.displacement)
+    modelled = tuple((y + offset).tolist())
+    return Trace(part.record, part.time, part.inputs["voltage"], measured, modelled)

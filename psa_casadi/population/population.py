@@ -1,4 +1,4 @@
-"""A population of devices: what is common, what spreads, who stands out, batches and drift.
+"""A population of devices: common values, their spread, outliers, batches and drift.
 
 Parameters that differ between two or more findings by more than their noise.
 
@@ -22,7 +22,7 @@ import scipy
 from psa_casadi.components import COMPONENTS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.population.finding import NORMAL_95, Finding, Found
+from psa_casadi.population.finding import NORMAL_95, Estimate, Finding
 from psa_casadi.population.statistics import (
     FEWEST,
     LIMIT,
@@ -60,40 +60,34 @@ class Estimates:
 
 
 def estimates(findings: Sequence[Finding], name: str) -> Estimates:
-    """Return what the devices tell of a parameter; devices that do not tell it are left out.
+    """Return the estimates of a parameter; devices that do not determine it are left out.
 
     A 95 % interval [low, high] has the standard error ln(high/low)/3.92 on a logarithmic scale,
     else (high - low)/3.92, as the intervals of a fit are made.
     """
-    rows = [(k, f.parameters[name]) for k, f in enumerate(findings) if name in f.parameters]
-    items = [(k, p.value, *p.interval) for k, p in rows if _tells(p) and p.interval]
-    log = name in _shown()[0] and all(min(value, low) > 0.0 for _, value, low, _ in items)
-    widths = [math.log(high / low) if log else high - low for *_, low, high in items]
-    first = rows[0][1] if rows else Found(0.0, "", None)
-    return Estimates(
-        name,
-        first.unit,
-        first.meaning,
-        log,
-        tuple(k for k, *_ in items),
-        np.array([math.log(value) if log else value for _, value, *_ in items]),
-        np.array(widths) / (2.0 * NORMAL_95),
-    )
+    every = [(k, f.parameters[name]) for k, f in enumerate(findings) if name in f.parameters]
+    rows = [(k, p.value, *p.interval) for k, p in every if _is_determined(p) and p.interval]
+    log = name in _declared()[0] and all(min(value, low) > 0.0 for _, value, low, _ in rows)
+    theta = [math.log(value) if log else value for _, value, *_ in rows]
+    widths = [math.log(high / low) if log else high - low for *_, low, high in rows]
+    first = every[0][1] if every else Estimate(0.0, "", None)
+    places, errors = tuple(k for k, *_ in rows), np.array(widths) / (2.0 * NORMAL_95)
+    return Estimates(name, first.unit, first.meaning, log, places, np.array(theta), errors)
 
 
 def names_of(findings: Sequence[Finding]) -> tuple[str, ...]:
-    """Return the names of the parameters that a device tells, in the order of the first files."""
-    result = (n for f in findings for n, p in f.parameters.items() if _tells(p))
-    return tuple(dict.fromkeys(result))
+    """Return the parameters that a device determines, in the order of the first files."""
+    names = (n for f in findings for n, p in f.parameters.items() if _is_determined(p))
+    return tuple(dict.fromkeys(names))
 
 
-def _tells(p: Found) -> bool:
-    return p.told and p.interval is not None and p.interval[1] > p.interval[0]
+def _is_determined(p: Estimate) -> bool:
+    return p.determined and p.interval is not None and p.interval[1] > p.interval[0]
 
 
 @cache
-def _shown() -> tuple[frozenset[str], dict[str, str]]:
-    """Return the parameters that are fitted on a logarithmic scale, and units that are shown."""
+def _declared() -> tuple[frozenset[str], dict[str, str]]:
+    """Return the parameters that are fitted on a logarithmic scale, and units of display."""
     every = [p for c in (*COMPONENTS.values(), *EFFECTS.values()) for p in c.parameters]
     return (
         frozenset(p.name for p in every if p.log),
@@ -102,8 +96,8 @@ def _shown() -> tuple[frozenset[str], dict[str, str]]:
 
 
 def display_unit(name: str, unit: str) -> str:
-    """Return the unit that a parameter is shown in."""
-    return _shown()[1].get(name, unit)
+    """Return the unit in which a parameter is displayed."""
+    return _declared()[1].get(name, unit)
 
 
 #: Days in a year, the unit of time of drifts.
@@ -137,7 +131,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Frequency:
-    """How often something was found: count, of how many, and Wilson's 95 % interval."""
+    """How often a verdict or a cause occurs: count, of how many, and Wilson's 95 % interval."""
 
     what: str
     count: int
@@ -150,7 +144,7 @@ class Population:
     """What a population shows.
 
     `outliers`, `batch_p` and `drift_p` are adjusted over all parameters (and devices); the latter
-    two are by parameter. `left_out` says which parameters too few devices tell.
+    two are by parameter. `left_out` are the parameters that too few devices determine.
     """
 
     findings: tuple[Finding, ...]
@@ -180,16 +174,10 @@ def population(findings: Sequence[Finding]) -> Population:
     over all tests of one kind.
 
     Raises:
-        InputError: no parameter is told by more than three devices.
+        InputError: no parameter is determined by more than three devices.
     """
-    spreads: list[Spread] = []
-    few: list[str] = []
-    for name in names_of(findings):
-        result = estimates(findings, name)
-        if len(result.places) <= FEWEST:
-            few.append(name)
-        else:
-            spreads.append(_spread(findings, result))
+    every = [estimates(findings, name) for name in names_of(findings)]
+    spreads = [_spread(findings, e) for e in every if len(e.places) > FEWEST]
     if not spreads:
         raise InputError(
             f"No parameter is told by more than {FEWEST} of the {len(findings)} devices, so there"
@@ -197,34 +185,36 @@ def population(findings: Sequence[Finding]) -> Population:
         )
     diagnosed = [f for f in findings if f.verdict]  # rivals are one cause
     causes = [" or ".join((c.effect, *c.or_else)) for f in diagnosed for c in f.causes]
+    batch_p = {s.estimates.name: s.batches.p_value for s in spreads if s.batches}
+    drift_p = {s.estimates.name: s.drift.p_value for s in spreads if s.drift}
     return Population(
         findings=tuple(findings),
         spreads=tuple(spreads),
         outliers=_outliers(findings, spreads),
-        batch_p=_over_parameters(
-            {s.estimates.name: s.batches.p_value for s in spreads if s.batches}
-        ),
-        drift_p=_over_parameters({s.estimates.name: s.drift.p_value for s in spreads if s.drift}),
+        batch_p=_over_parameters(batch_p),
+        drift_p=_over_parameters(drift_p),
         verdicts=frequencies([f.verdict for f in diagnosed]),
         causes=frequencies(causes, len(diagnosed)) if causes else (),
-        left_out=tuple(few),
+        left_out=tuple(e.name for e in every if len(e.places) <= FEWEST),
     )
 
 
 def _spread(findings: Sequence[Finding], result: Estimates) -> Spread:
     far = outliers(result.theta, result.errors)
-    kept = ~far.found
+    kept = ~far.outlying
     theta, errors = result.theta[kept], result.errors[kept]
     those = [findings[k] for k, keep in zip(result.places, kept, strict=True) if keep]
     batches = [f.batch for f in those]
-    tested = None
-    if all(batches) and 1 < len(set(batches)) < len(batches) - 1:
-        tested = batch_test(theta, errors, batches)
     days = [f.day.toordinal() / YEAR for f in those if f.day is not None]
-    moved = None
-    if len(days) == len(those) and len(days) > FEWEST and np.ptp(days) > 0.0:
-        moved = drift(theta, errors, days)
-    return Spread(result, mixed_regression(theta, errors), far, tested, moved)
+    several = all(batches) and 1 < len(set(batches)) < len(batches) - 1
+    dated = len(days) == len(those) and len(days) > FEWEST and np.ptp(days) > 0.0
+    return Spread(
+        result,
+        mixed_regression(theta, errors),
+        far,
+        batch_test(theta, errors, batches) if several else None,
+        drift(theta, errors, days) if dated else None,
+    )
 
 
 def _outliers(findings: Sequence[Finding], spreads: Sequence[Spread]) -> tuple[Outlier, ...]:
@@ -258,7 +248,7 @@ def frequencies(words: Sequence[str], of: int | None = None) -> tuple[Frequency,
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """A parameter that two findings or more tell; p values of "all have one value"."""
+    """A parameter that two findings or more determine; p values of "all have one value"."""
 
     estimates: Estimates
     p_value: float
@@ -271,7 +261,7 @@ class Difference:
 
 
 def differences(findings: Sequence[Finding]) -> tuple[Difference, ...]:
-    """Return the parameters that two findings or more tell, in the order of the files."""
+    """Return the parameters that two findings or more determine, in the order of the files."""
     shared = [e for n in names_of(findings) if len((e := estimates(findings, n)).places) > 1]
     p_values = [mixed_regression(e.theta, e.errors).p_value for e in shared]
     corrected = adjusted(p_values, "bonferroni")

@@ -5,7 +5,7 @@ Regression over devices that differ by more than the noise of each: random effec
     theta_i = X_i b + u_i + e_i,    u_i ~ N(0, tau^2),    e_i ~ N(0, s_i^2)
 
 The estimates theta_i come with known standard errors s_i; tau is the spread of the devices
-themselves. For a given tau, b is the weighted least squares with w_i = 1/(s_i^2 + tau^2), and
+themselves. At a tau, b is the weighted least squares with w_i = 1/(s_i^2 + tau^2), and
 
     Q(tau^2) = sum_i w_i (theta_i - X_i b)^2  ~  chi^2(n - p).
 
@@ -28,10 +28,10 @@ them, its estimate is
 
 with Student's t of n - 2 degrees of freedom as the distribution of z, since tau is estimated
 (W. Viechtbauer and M. W.-L. Cheung, Res. Synth. Methods 1 (2010) 112: studentized deleted
-residuals). A device far out widens tau and hides others, so those already found are left out of the
-others' mean and spread, and all are tested again, until no more are found (forward search).
+residuals). A device far out widens tau and hides others, so outliers are left out of the others'
+mean and spread, and all are tested again, until there are no more (forward search).
 
-Batches that differ, and drift over the date, told from the spread of devices and their noise.
+Batches that differ, and drift over the date, beyond the spread of devices and their noise.
 
 Batches: theta_ij = mu_j + u_ij + e_ij with one spread tau within all batches (`mixed_regression`
 with a column for each). That all mu_j are equal is tested by
@@ -56,7 +56,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.units import BoolArray, FloatArray
 
 Adjustment = Literal["benjamini-hochberg", "bonferroni"]
-#: What an adjusted p value must be below to be told.
+#: Adjusted p values below this are significant.
 LIMIT = 0.05
 
 
@@ -64,8 +64,8 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
     """Return adjusted p values, shape (n,) as `p`.
 
     `bonferroni` (Holm's step-down form) bounds the chance of one false alarm or more.
-    `benjamini-hochberg` bounds the expected share of false ones among those told; where nothing is
-    true both bounds are the same.
+    `benjamini-hochberg` bounds the expected share of false ones among the significant; where
+    nothing is true both bounds are the same.
 
     Sources: S. Holm, Scand. J. Statist. 6 (1979) 65; Y. Benjamini and Y. Hochberg, J. R. Statist.
     Soc. B 57 (1995) 289.
@@ -84,7 +84,7 @@ def adjusted(p: ArrayLike, how: Adjustment = "benjamini-hochberg") -> FloatArray
 
 #: What intervals are meant to hold.
 LEVEL = 0.95
-#: Newton's steps for tau^2 end when one is below this share of it, or after so many.
+#: Newton's steps for tau^2 end when one is below this share of it, and their largest number.
 PRECISION, MOST_STEPS = 1e-10, 200
 
 
@@ -149,18 +149,12 @@ def mixed_regression(
     ends = [
         solve_tau2(y, s, x, float(scipy.stats.chi2.ppf(0.5 + h * LEVEL / 2, dof))) for h in (1, -1)
     ]
+    tau, low, high = (float(np.sqrt(t)) * unit for t in (tau2, *ends))
     b, covariance, q = _weighted(y, s, x, tau2)
-    scale = max(1.0, q / dof)
+    covariance = covariance * max(1.0, q / dof) * unit**2
     q0 = _weighted(y, s, x, 0.0)[2]
-    return MixedFit(
-        b * unit,
-        covariance * scale * unit**2,
-        float(np.sqrt(tau2)) * unit,
-        (float(np.sqrt(ends[0])) * unit, float(np.sqrt(ends[1])) * unit),
-        q0,
-        float(scipy.stats.chi2.sf(q0, dof)),
-        dof,
-    )
+    p_value = float(scipy.stats.chi2.sf(q0, dof))
+    return MixedFit(b * unit, covariance, tau, (low, high), q0, p_value, dof)
 
 
 def solve_tau2(y: FloatArray, s: FloatArray, x: FloatArray, wanted: float) -> float:
@@ -183,7 +177,7 @@ def solve_tau2(y: FloatArray, s: FloatArray, x: FloatArray, wanted: float) -> fl
 def _weighted(
     y: FloatArray, s: FloatArray, x: FloatArray, tau2: float
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return b, its covariance and Q for a given tau^2."""
+    """Return b, its covariance and Q at a tau^2."""
     root = 1.0 / np.sqrt(s**2 + tau2)
     q, r = np.linalg.qr(x * root[:, None])
     inverse = np.linalg.inv(r)
@@ -192,7 +186,7 @@ def _weighted(
     return b, inverse @ inverse.T, float(rest @ rest)
 
 
-#: The others must be so many; rounds after which the search ends.
+#: Fewest others; rounds after which the search ends.
 FEWEST, _ROUNDS = 3, 20
 #: At most this share of the devices may be outliers: else they are a second kind.
 _MOST = 0.3
@@ -202,12 +196,12 @@ _AT_ONCE = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """z (n,), its two-sided p value, the adjusted one, and which devices are told."""
+    """z (n,), its two-sided p value, the adjusted one, and which devices are outlying."""
 
     z: FloatArray
     p: FloatArray
     p_adjusted: FloatArray
-    found: BoolArray
+    outlying: BoolArray
 
 
 def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
@@ -221,14 +215,14 @@ def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     y, s = np.asarray(theta, dtype=float), np.asarray(errors, dtype=float)
     if y.size <= FEWEST:
         raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
-    result = np.zeros(y.size, dtype=np.bool_)
-    z, p, corrected = _tested(y, s, result)
+    apart = np.zeros(y.size, dtype=np.bool_)
+    z, p, corrected = _tested(y, s, apart)
     for _ in range(_ROUNDS):
-        more = result | (corrected < LIMIT)
-        if (more == result).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
+        more = apart | (corrected < LIMIT)
+        if (more == apart).all() or more.sum() > _MOST * y.size or (~more).sum() <= FEWEST:
             break
-        result = more
-        z, p, corrected = _tested(y, s, result)
+        apart = more
+        z, p, corrected = _tested(y, s, apart)
     return Outliers(z, p, corrected, corrected < LIMIT)
 
 

@@ -27,7 +27,7 @@ def sampler_and_arviz() -> tuple[Any, Any]:
     """Return the modules nutpie and arviz. Raises InputError where one is not installed."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # arviz tells of its next version
+            warnings.simplefilter("ignore", FutureWarning)  # arviz announces its next version
             return import_module("nutpie"), import_module("arviz")
     except ImportError as error:
         raise InputError(
@@ -74,7 +74,7 @@ def predictive(
     offset that was projected out. With `fit_offset`, for draws of the prior, whose offsets are
     flat, a sensor's offset is the one that fits best, and the level is that of the fit.
     """
-    kept, displayed, noise, blocks = [], [], [], task.density.blocks
+    kept, readings, noise, blocks = [], [], [], task.density.blocks
     for theta in draws:
         try:
             parts = predict(
@@ -93,25 +93,23 @@ def predictive(
                 y, left = y + np.mean(left), left - np.mean(left)
             level = b.level
             if not fit_offset:
-                level = float(np.sqrt(left @ left / b.alike / rng.chisquare(b.count)))
+                level = float(np.sqrt(left @ left / b.correlation_time / rng.chisquare(b.count)))
                 if free and b.channel:
-                    y = y + level * rng.standard_normal() / np.sqrt(len(left) / b.alike)
+                    y = y + level * rng.standard_normal() / np.sqrt(len(left) / b.correlation_time)
             clean.append(y)
             levels.append(level)
         kept.append(theta)
         noise.append(levels)
-        displayed.append(
+        readings.append(
             [y + s * rng.standard_normal(len(y)) for y, s in zip(clean, levels, strict=True)]
         )
+    sizes = [task.experiments[b.record].record.n for b in blocks]
     return Predictive(
         theta=np.array(kept).reshape(len(kept), draws.shape[1]),
         readings=tuple(
-            np.array([item[k] for item in displayed]).reshape(
-                len(kept), task.experiments[b.record].record.n
-            )
-            for k, b in enumerate(blocks)
+            np.array([y[k] for y in readings]).reshape(len(kept), n) for k, n in enumerate(sizes)
         ),
-        noise=tuple(np.array([item[k] for item in noise]) for k, _ in enumerate(blocks)),
+        noise=tuple(np.array([s[k] for s in noise]) for k, _ in enumerate(blocks)),
         failed=len(draws) - len(kept),
     )
 

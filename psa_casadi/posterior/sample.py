@@ -1,4 +1,4 @@
-"""`psa.sample`: the whole posterior of a model's parameters, given its records."""
+"""`psa.sample`: the whole posterior of a model's parameters from its records."""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -31,12 +31,12 @@ from psa_casadi.simulation.start import is_stack
 
 #: Share of the highest density interval, and its ends.
 HDI = 0.94
-#: The chains disagree above this r-hat (Vehtari and others, Bayesian Analysis 16, 2021), and tell
-#: too little below so many effective draws per chain.
+#: The chains disagree above this r-hat (Vehtari and others, Bayesian Analysis 16, 2021), and are
+#: too short below this many effective draws per chain.
 MOST_RHAT, LEAST_ESS = 1.01, 100.0
-#: A posterior wider than this share of its prior tells of the prior.
+#: A posterior wider than this share of its prior depends on the prior.
 _PRIOR_SHARE = 0.5
-#: Samples count as correlated where so many are worth one.
+#: Residuals count as coloured from this autocorrelation time, in samples, on.
 _COLOURED = 1.5
 
 
@@ -62,7 +62,7 @@ class Figures:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Reported):
-    """Draws of parameters, starts and offsets, given records, with all that stands behind them.
+    """Draws of parameters, starts and offsets from records, with their task and chains.
 
     `model` has the values of the fit that the chains start at; `tree` is an
     `arviz.InferenceData` with the groups posterior, sample_stats, prior, prior_predictive,
@@ -158,10 +158,10 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     if not task.converged:
         doubts.append(note("start_cut_off"))
     for b in task.density.blocks:
-        if b.alike > _COLOURED:
+        if b.correlation_time > _COLOURED:
             named = column_of(task, b) if task.channel(b) != DISPLACEMENT else None
             record = task.experiments[b.record].record.name
-            doubts.append(note("coloured", record=record, worth=b.alike, output=named))
+            doubts.append(note("coloured", record=record, worth=b.correlation_time, output=named))
     held = [f.name for f in figures if f.prior_share > _PRIOR_SHARE]
     if held:
         doubts.append(note("of_the_prior", names=held))
@@ -195,22 +195,21 @@ def sample(
     p(theta | y) is proportional to prod_r |y_r - x_r(theta)|^-(n_r / c_r) times the weak priors of
     an identification, theta_k / w_k normal about 0 within the parameters' bounds: the noise level
     of every output in every record r has the prior 1 / sigma and is integrated out (but those of a
-    stack's columns beside the displacement, which are known), and c_r samples count as one where
+    stack's further columns, which are known), and c_r samples count as one where
     residuals are correlated (their long-run variance over their variance, at the fit). The chains
-    start around the fit that is found from the model's values, of a model of one's own from several
-    starts, in coordinates that its covariance whitens; the gradient is exact, from the
+    start around the fit from the model's values (of any model but a stack from several starts), in
+    coordinates that its covariance whitens; the gradient is exact, from the
     sensitivities.
 
     Args:
-        model: A stack's model, as `psa.identify` returns it or `psa.stack_model`, or one of one's
-            own.
+        model: A stack's model, as `psa.identify` returns it or `psa.stack_model`, or any other.
         records: Those of one device, as `psa.identify` takes them.
         free: Names of the parameters that are sampled; by default those that the model was fitted
-            in, else those that voltage and displacement can tell; of a model of one's own those
-            that are `fitted`.
+            in, else those that voltage and displacement determine; of other models those that are
+            `fitted`.
         prior: Values that the priors are centred at, in the parameters' units; by default those of
-            a stack of the records' size, as a search begins with, and declared ones of effects and
-            of models of one's own.
+            a stack of the records' size, as a search starts with, and declared ones of effects and
+            of other models.
         widths: Standard deviations of the priors: of ln(value) for parameters that span decades, in
             ordinary changes for others; by default 3 and 10, and 1 for lags.
         chains: Number of chains.
@@ -218,9 +217,9 @@ def sample(
         tune: Draws of each chain before, to adapt step and metric.
         seed: Seed of all that is random.
         cores: Chains at a time; by default one for each core.
-        progress: Is told what is being done.
-        words: Of a model of one's own those of `psa.identify`: `starts`, `zeros`, `known_start`,
-            `hold`.
+        progress: Gets what is being done, in words.
+        words: Of models other than a stack's those of `psa.identify`: `starts`, `zeros`,
+            `known_start`, `hold`.
 
     Raises:
         InputError: The extra `sample` is not installed, a name is unknown.
@@ -262,7 +261,7 @@ def sample(
     )
 
 
-#: The words for the records of a model of one's own, and its search.
+#: The options for records and search of models other than a stack's.
 _OWN = ("starts", "zeros", "known_start", "hold")
 
 

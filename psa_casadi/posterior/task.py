@@ -14,9 +14,8 @@ from psa_casadi.identification.fitting.fit import (
     unknowns_around,
     weights_of,
 )
-from psa_casadi.identification.fitting.further import further_of
 from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
-from psa_casadi.identification.fitting.prediction import predict
+from psa_casadi.identification.fitting.prediction import further_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.multistart import free_of
 from psa_casadi.identification.own_model import identify_ode
@@ -80,16 +79,16 @@ class Within:
 class Block:
     """The weighted residuals `rows` of one channel in one record, whose noise level is unknown.
 
-    `count` is how many independent samples they are worth, less one where an offset was projected
-    out of them: `alike` samples count as one where they are coloured. `level` is their rms, in the
-    channel's unit.
+    `count` is their effective number of independent samples, less one where an offset was projected
+    out of them: their number over the integrated `correlation_time`, in samples, which is 1 for
+    white residuals. `level` is their rms, in the channel's unit.
     """
 
     rows: slice
     count: float
     record: int = 0
     channel: int = 0
-    alike: float = 1.0
+    correlation_time: float = 1.0
     level: float = 1.0
 
 
@@ -98,7 +97,7 @@ class Density:
     """ln p(u | records), up to a constant, with its gradient, in whitened coordinates u.
 
     ln p = -sum_b (m_b / 2) ln |r_b|^2 - |r_p|^2 / 2 + ln |d theta / d z|, with the weighted
-    residuals r_b of every block and m_b the samples that they are worth: each block's noise level
+    residuals r_b of every block and m_b their effective number of samples: each block's noise level
     has Jeffreys' prior 1 / sigma and is integrated out. r_p are the rows outside the blocks: weak
     priors and a stack's further columns, whose levels are known. theta lies within its bounds
     (`Within`), and z = z_0 + L u, with the factor L of the covariance at the fit, so that u has
@@ -156,7 +155,7 @@ class Task:
     """A posterior to sample: `density` in u, and the fit that it is centred on.
 
     `theta` (size,) are the coordinates of the fit, `covariance` theirs, white residuals assumed.
-    `sentences` tell what was done to the records.
+    `sentences` are what was done to the records.
     """
 
     model: Model
@@ -189,7 +188,7 @@ def task_of(
     """Fit the model from its values and set up the density around that fit.
 
     `free` are the parameters that are sampled (by default those that the model was fitted in, else
-    those that records of a stack can tell); `prior` are the values that the priors are centred at
+    those that records of a stack determine); `prior` are the values that the priors are centred at
     and `widths` their standard deviations, in ln units for parameters that span decades, else in
     ordinary changes. Raises InputError, SimulationError.
     """
@@ -217,7 +216,7 @@ def own_task_of(
     widths: Mapping[str, float] | None = None,
     **words: Any,
 ) -> Task:
-    """Identify a model of one's own and set up the density around that fit.
+    """Identify any model but a stack's and set up the density around that fit.
 
     The priors are centred at the declared values. `words` are those of `identify_ode`, the rest as
     in `task_of`.
@@ -251,7 +250,7 @@ def _around(
 ) -> Task:
     """Fit from the values, with priors about those of `centre`, and set up the density there.
 
-    Every record begins as in the fit `fit`, if there is one.
+    Every record starts as in the fit `fit`, if there is one.
     """
     names = tuple(values)
     unknowns = unknowns_around(centre, names, experiments, sigma, placed=centre)
@@ -304,10 +303,10 @@ def _refuse(model: Model, names: Sequence[str], values: Mapping[str, float]) -> 
 def _centres(
     model: Model, records: Sequence[Record], names: Sequence[str], values: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return where the priors are centred: as given, else a stack of the records' size.
+    """Return where the priors are centred: at `values`, else a stack of the records' size.
 
     Never where a fit ended, which would count the records twice. What such a stack does not have
-    (effects) is centred at the declared value; a loop of the other sign at the model's own, as its
+    (effects) is centred at the declared value; a loop of the other sign at the model's, as its
     coordinates do not pass 0.
     """
     stiffness = next((model.values[n] for n in ("k_B", "k") if n in model.values), None)
@@ -339,26 +338,25 @@ def _task(
         for r, e in enumerate(experiments):
             first, last = last, last + int(e.at(j).sum())
             rows, item = slice(first, last), residual[first:last]
-            if not item.size:
+            if first == last:
                 continue
-            similar, projected = 1.0, float(j > 0 and channel.offset)
+            time, projected = 1.0, float(j > 0 and channel.offset)
             if not channel.factors:
-                lags = autocovariance(item)  # how many neighbouring samples count as one
+                lags = autocovariance(item)
                 ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
-                similar = max(1.0, ratio)
+                time = max(1.0, ratio)
                 level = (channel.level if j else sigma[r]) * e.share(j)
                 level *= float(np.sqrt(np.mean(item**2)))
-                count = (len(item) - projected) / similar
-                blocks.append(Block(rows, count, r, j, similar, level))
-            precision += jacobian[rows].T @ jacobian[rows] / similar
+                blocks.append(Block(rows, (len(item) - projected) / time, r, j, time, level))
+            precision += jacobian[rows].T @ jacobian[rows] / time
     rest = jacobian[last:]
     precision += rest.T @ rest
     within = Within(low, high)
-    covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=np.float64)
+    covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True))
     moving = np.ones(unknowns.size, dtype=bool)
     if not unknowns.offset_scale:  # without an unknown zero, offsets stay at 0
         moving[list(unknowns.offsets)] = False
-    centre, factor = _whitening(within, minimum.theta, precision, covariance, moving)
+    centre, factor = _whitening(within, minimum.theta, precision, np.diag(covariance), moving)
     return Task(
         model=model,
         experiments=experiments,
@@ -376,14 +374,14 @@ def _whitening(
     within: Within,
     theta: FloatArray,
     precision: FloatArray,
-    covariance: FloatArray,
+    variances: FloatArray,
     moving: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return z at the fit, a little inside the bounds, and a factor of the covariance of z.
 
     A column of the factor for each of the coordinates that are `moving`.
     """
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    spread = np.sqrt(np.maximum(variances, 0.0))
     room = np.where(within.bounded, 0.25 * (within.high - within.low), np.inf)
     edge = np.where(within.bounded, np.minimum(_INSIDE * spread, room), 0.0)
     inside = np.clip(theta, within.low + edge, within.high - edge)
@@ -391,8 +389,8 @@ def _whitening(
     _, slope, bend = within.theta(z)
     curvature = precision * np.outer(slope, slope)
     both = np.isfinite(within.low) & np.isfinite(within.high)
-    text = np.where(both, 0.5 * (1.0 - bend**2), 0.0)
-    curvature += np.diag(text + np.where(inside != theta, _TAIL, 0.0))
+    tail = np.where(inside != theta, _TAIL, 0.0)
+    curvature += np.diag(np.where(both, 0.5 * (1.0 - bend**2), 0.0) + tail)
     sizes, directions = np.linalg.eigh(curvature[np.ix_(moving, moving)])
     sizes = np.maximum(sizes, 1e-12 * sizes[-1])
     factor = np.zeros((len(z), len(sizes)))

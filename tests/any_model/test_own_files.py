@@ -15,7 +15,7 @@ import pytest
 from scipy.io import savemat
 
 import psa_casadi as psa
-from psa_casadi.identification.experiments import experiments_of, given_to, told_of_columns
+from psa_casadi.identification.experiments import column_notes, experiments_of, given_to
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
 from psa_casadi.units import FloatArray
@@ -243,7 +243,7 @@ def test_a_column_that_is_like_a_missing_output_is_named(tmp_path: Path) -> None
         name="hand", time=T, columns={"valve": VALVE, "flow": FLOW, "Speed": SPEED, "ol_temp": WARM}
     )
     for inputs in (columns, file, by_hand):
-        text = " ".join(map(str, told_of_columns(_pump(), [_run(inputs)])))
+        text = " ".join(map(str, column_notes(_pump(), [_run(inputs)])))
         assert "No record has a column 'oil_temp'; that output is not compared." in text
         assert "The records have 'ol_temp'; name the column 'oil_temp' if it is that." in text
 

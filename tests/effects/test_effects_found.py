@@ -13,7 +13,7 @@ from psa_casadi import reference
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.identification.search import fit_base
-from psa_casadi.identification.start.linear_response import Shaken, modes_of
+from psa_casadi.identification.start.linear_response import Response, modes_of
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine
@@ -53,7 +53,7 @@ def test_modes_are_read_off_a_residual() -> None:
     drive, time = drive_and_time()
     left = sum(share * response(f, z, drive, time) for f, z, share in HIDDEN)
     left = left + 1e-3 * np.std(left) * noise(COUNT, 2)
-    shaken = Shaken(drive, left, np.ones(COUNT, bool), 1.0 / RATE)
+    shaken = Response(1.0 / RATE, drive, left, np.ones(COUNT, bool))
     items = sorted(
         modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95), key=lambda m: m.frequency
     )
@@ -67,7 +67,7 @@ def test_modes_are_read_off_a_residual() -> None:
 
 def test_noise_has_no_modes() -> None:
     drive, _ = drive_and_time()
-    shaken = Shaken(drive, noise(COUNT, 3), np.ones(COUNT, bool), 1.0 / RATE)
+    shaken = Response(1.0 / RATE, drive, noise(COUNT, 3), np.ones(COUNT, bool))
     assert modes_of([shaken], np.ones((COUNT, 1)), most=9, better=0.95) == []
 
 

@@ -71,7 +71,7 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
     }
 
 
-#: What `psa identify` finds for a named stack with a record of its own.
+#: What `psa identify` fits for a named stack with a record.
 IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
 
 
@@ -80,7 +80,7 @@ def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
 
     A search from nothing is at least as good. It may be better: it frees masses besides, and in the
     demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
-    c_P on its bound, which it says. Offset and memory are fitted.
+    c_P on its bound, with a warning. Offset and memory are fitted.
     """
     model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
     y: FloatArray = np.asarray(record.displacement)

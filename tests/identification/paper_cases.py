@@ -1,6 +1,7 @@
 """Steps in closed form, and records of the reference that the paper's method is tried on."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +13,7 @@ from psa_casadi.records import Record, sine, time_grid
 from psa_casadi.units import ComplexArray, FloatArray
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
-#: A loop that leads, for which the paper's own condition gamma > beta holds (over k_L).
+#: A loop that leads, for which the paper's condition gamma > beta holds (over k_L).
 LEADING = {"A": 0.25, "beta": 0.05, "gamma": 0.2, "delta": -0.02}
 
 
@@ -31,13 +32,11 @@ def poles(p: dict[str, float]) -> ComplexArray:
 
 def residues(p: dict[str, float]) -> ComplexArray:
     """Return r_i of the step response 1 + sum r_i e^(p_i t), by the limit (s - p_i) G(s)/s."""
-    items = []
+    result, scale = [], p["tau"] * p["m_P"] * p["m_B"] * compliance(p)
     for k, pole in enumerate(poles(p)):
-        others = np.delete(poles(p), k)
-        scale = p["tau"] * p["m_P"] * p["m_B"] * compliance(p)
         both = (p["c_B"] + p["c_P"]) * pole + p["k_B"] + p["k_P"]
-        items.append(both / (scale * pole * np.prod(pole - others)))
-    return np.array(items)
+        result.append(both / (scale * pole * np.prod(pole - np.delete(poles(p), k))))
+    return np.array(result)
 
 
 def step_response(p: dict[str, float], time: FloatArray) -> FloatArray:
@@ -64,16 +63,15 @@ def closed_step(p: dict[str, float], duration: float, samples: int, noise: float
     g = step_response(p, time) + noise * np.random.default_rng(0).standard_normal(samples)
     voltage = np.concatenate([[0.0], np.full(samples, p["u_rated"])])
     x = np.concatenate([[0.0], g]) * p["k_L"] * compliance(p) * p["u_rated"]
-    return Record(
-        name="step", time=np.concatenate([[0.0], time + 1e-10]), voltage=voltage, displacement=x
-    )
+    time = np.concatenate([[0.0], time + 1e-10])
+    return Record(name="step", time=time, voltage=voltage, displacement=x)
 
 
-def respond(p: dict[str, float], time: FloatArray, voltage: FloatArray) -> FloatArray:
-    drive = reference.from_samples(time, voltage)
-    return reference.simulate(
-        p, drive, time, breakpoints=time[1:3].tolist(), rtol=1e-9
-    ).displacement
+def responding(p: dict[str, float], name: str, time: FloatArray, voltage: FloatArray) -> Record:
+    """Return a record of the reference."""
+    drive, breaks = reference.from_samples(time, voltage), time[1:3].tolist()
+    x = reference.simulate(p, drive, time, breakpoints=breaks, rtol=1e-9).displacement
+    return Record(name=name, time=time, voltage=voltage, displacement=x)
 
 
 @lru_cache(maxsize=8)
@@ -84,36 +82,21 @@ def loop(name: str = "P-885.51", frequency: float = 1.0, leading: bool = False) 
         p |= {key: share * p["k_L"] for key, share in LEADING.items()}
     time = time_grid(2.0 / frequency, 1.0 / (500.0 * frequency))
     voltage = sine(time, 0.0, p["u_rated"], frequency)
-    return Record(
-        name=f"loop {frequency:g} Hz",
-        time=time,
-        voltage=voltage,
-        displacement=respond(p, time, voltage),
-    )
+    return responding(p, f"loop {frequency:g} Hz", time, voltage)
 
 
 @lru_cache(maxsize=4)
 def real_step(volts: float, name: str = "P-885.51") -> Record:
-    """Return the reference's response, hysteresis and all, to a jump of so many volts."""
-    p = values(name)
+    """Return the reference's response, hysteresis and all, to a jump of `volts`."""
     time = np.linspace(0.0, 4e-3, 4001)
     voltage = np.full(time.shape, volts)
     voltage[0] = 0.0
-    return Record(
-        name=f"step {volts:g} V", time=time, voltage=voltage, displacement=respond(p, time, voltage)
-    )
-
-
-def changed(record: Record, displacement: FloatArray) -> Record:
-    return Record(
-        name=record.name, time=record.time, voltage=record.voltage, displacement=displacement
-    )
+    return responding(values(name), f"step {volts:g} V", time, voltage)
 
 
 def noisy(record: Record, share: float) -> Record:
-    x = np.asarray(record.displacement)
-    draw = np.random.default_rng(1).standard_normal(record.n)
-    return changed(record, x + share * record.range_m * draw)
+    draw = share * record.range_m * np.random.default_rng(1).standard_normal(record.n)
+    return replace(record, displacement=np.asarray(record.displacement) + draw)
 
 
 def transfer(theta: FloatArray, frequency: FloatArray) -> ComplexArray:

@@ -75,7 +75,7 @@ def test_a_given_stiffness_ends_the_freedom_of_scale() -> None:
 
 
 def made(model: Model, errors: dict[str, float], free: dict[str, float]) -> Determinacy:
-    """Return a determinacy of relative `errors` with a free direction (relative) beside them."""
+    """Return a determinacy of relative `errors` with a free direction (relative)."""
     names = tuple(errors)
     values = np.array([model.values[n] for n in names])
     along = np.array([free.get(n, 0.0) for n in names]) * values

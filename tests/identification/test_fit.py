@@ -77,7 +77,7 @@ def test_coordinates_invert_values_and_slopes_are_their_derivatives(
     "effects", [(), pytest.param(("slow_creep", "rate_independent_asymmetry"), marks=slow)]
 )
 def test_the_jacobian_is_central_differences_of_predictions(effects: tuple[str, ...]) -> None:
-    """Two runs differ by up to 4e-7 of the range beside the step, for they step differently."""
+    """Two runs differ by up to 4e-7 of the range over the step, for they step differently."""
     model = model_with(*effects)
     experiments = [whole(record_of(model, seed, 120)) for seed in (1, 2)]
     unknowns = unknowns_of(model, free_parameters(model), [{}, {}], [2.0, 3.0], 1e-6)
@@ -150,7 +150,7 @@ def test_the_parts_of_a_fit_belong_together() -> None:
 
 
 def _after_a_history(model: Model, peak: float, seed: int) -> Record:
-    """A record that begins at 20 V, where the stack has come down to from a peak."""
+    """A record that starts at 20 V, where the stack has come down to from a peak."""
     time = time_grid(4.0, 2e-3)
     before = time < 2.0
     down = np.interp(time, [0.0, 1.0, 2.0], [0.0, peak, 20.0])
@@ -167,7 +167,7 @@ def _after_a_history(model: Model, peak: float, seed: int) -> Record:
 
 
 def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> None:
-    """Also where its own first tenth tells another memory, by an error that the model has there."""
+    """Also where its first tenth gives another memory, by an error that the model has there."""
     model = model_with()
     records = [_after_a_history(model, 90.0, seed) for seed in (1, 2, 3)]
     held = records[2]
@@ -176,26 +176,26 @@ def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> No
     wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
     experiments = divided(records[:2], [replace(held, displacement=wrong)])
     result = fitted(model, experiments)
-    shared, item = result.predicted(experiments)[2], _from_its_own_beginning(result, experiments[2])
+    shared, item = result.predicted(experiments)[2], _from_first_tenth(result, experiments[2])
     truth = np.asarray(held.displacement)[~lead]
     errors = [float(np.std(x[~lead] - truth)) for x in (shared, item)]
     assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
-    # one that begins at another voltage has its own start
+    # a record with another first voltage has another start
     other = record_of(model, 5)
     apart = divided(records[:2], [replace(other, voltage=other.voltage + 5.0)])
     elsewhere = fitted(model, apart)
-    plain = _from_its_own_beginning(elsewhere, apart[2])
+    plain = _from_first_tenth(elsewhere, apart[2])
     np.testing.assert_allclose(elsewhere.predicted(apart)[2], plain, rtol=0, atol=0.1 * SIGMA)
 
 
-def _from_its_own_beginning(found: Fit, held: Experiment) -> FloatArray:
+def _from_first_tenth(whole_fit: Fit, held: Experiment) -> FloatArray:
     """The prediction of a record whose start and offset are fitted to its first tenth."""
     lead = Experiment(held.record, held.known, held.held_out)
-    return fit(found.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
+    return fit(whole_fit.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
 
 
 def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
-    """Not of its beginning either, which only finds where its prediction begins."""
+    """Not of its first tenth either, which only gives the start of its prediction."""
     model = model_with()
     records = [record_of(model, seed) for seed in (1, 2, 3)]
     nonsense = np.random.default_rng(4).standard_normal(records[2].n)
@@ -209,7 +209,7 @@ def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
         np.testing.assert_allclose(result.residuals, alone.residuals, rtol=0, atol=1e-6 * SIGMA)
         assert not np.any(result.theta[count:])
         assert not np.any(result.jacobian[:, count:])
-    # nor does the search for where a fit begins
+    # nor does the search for the start of a fit
     bases = [fit_base(model, divided(records[:2], [held])) for held in others]
     assert bases[0].model.values == bases[1].model.values
 
@@ -256,7 +256,7 @@ def test_a_stack_that_never_settles_leaves_no_start_open(monkeypatch: pytest.Mon
 def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
     """What tries a fit tries the next one then."""
     monkeypatch.setattr(
-        "psa_casadi.identification.fitting.fit.motions_of", lambda *given: {"f": 1 / 0.0}
+        "psa_casadi.identification.fitting.fit.motions_of", lambda *_: {"f": 1 / 0.0}
     )
     record = record_of(model_with(), 1)
     with pytest.raises(SimulationError, match="numbers of the fit overflow"):
@@ -264,7 +264,7 @@ def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch
 
 
 def test_fits_of_one_minimum_are_the_same_place_wherever_their_priors_count_from() -> None:
-    """The prior of a lag is a factor of e around the given model's value, here off by e^7."""
+    """The prior of a lag is a factor of e around the model's value, here off by e^7."""
     model = stack_model("demo")
     time = time_grid(4e-3, 5e-6)
     voltage = multisine(time, 0.0, 60.0, (500.0, 3e4), seed=3)

@@ -1,7 +1,7 @@
-"""Columns beside the displacement: fitted, each with its own noise, and what each decided.
+"""Further columns: fitted, each with its noise, and what each decided.
 
 The plants are independent ones (`tests/studies/plants/further_columns.py`): other equations than
-the effects, and sensors with scales and zeros of their own.
+the effects, and sensors with scales and zeros.
 """
 
 import json
@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Objective, fit
-from psa_casadi.identification.fitting.further import scaled
+from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.compose import compose
@@ -82,12 +82,12 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
     assert p["sensor_2_scale"] == pytest.approx(0.83, rel=3e-3)
     assert p["strain_scale"] == pytest.approx(55.0, rel=3e-3)
     for f in fitted.further:
-        if f.column == "current":  # which shows lags that the displacement does not tell
+        if f.column == "current":  # which shows lags that the displacement does not determine
             assert f.rms < 2.0 * f.straight
             continue
         inputs = {n: getattr(read, n) for n in COLUMNS}[f.column]
         assert f.rms == pytest.approx(plants.FURTHER_NOISE * np.ptp(inputs), rel=0.2), f.column
-    # a charge tells the capacitance of the free stack, with what the displacement frees
+    # a charge gives the capacitance of the free stack, with what the displacement frees
     capacitance = capacitance_of([replace(read, current=None)])
     assert capacitance is not None
     assert capacitance.source == "charge"
@@ -151,7 +151,7 @@ def test_a_turned_sign_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("now", "then", "said"),
+    ("now", "then", "sentence"),
     [
         ({}, {}, "agrees with the model"),
         ({"slow_creep": 1.0}, {"slow_creep": 1.0}, "changes no name; it adds 7 "),
@@ -166,8 +166,8 @@ def test_a_turned_sign_is_told() -> None:
         ),
     ],
 )
-def test_decisions_in_words(now: dict[str, float], then: dict[str, float], said: str) -> None:
-    assert said in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
+def test_decisions_in_words(now: dict[str, float], then: dict[str, float], sentence: str) -> None:
+    assert sentence in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
 
 
 def test_a_column_explains_nothing_where_something_is_left() -> None:
@@ -225,7 +225,7 @@ def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
     assert decided.role == "input"
     assert set(decided.named_without) == set(BENDS)
     assert "load_stiffness is in the column" in decided.sentence
-    # and it tells the stiffness that it meets, which nothing else does
+    # and it determines the stiffness that it meets, which nothing else does
     stiffness = 1.0 / plants.plain(2).run.stack.compliance
     assert loaded.model.values["k_B"] == pytest.approx(stiffness, rel=0.15)
 

@@ -45,7 +45,7 @@ def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", slow_but(SEEDS[:1], SEEDS))
 def test_what_is_not_determined_is_listed(seed: int) -> None:
-    """Lags are short and alike: not all of them can be told."""
+    """Lags are short and similar: not all of them are determined."""
     result = identified(seed).determinacy
     assert {"tau", "R_s", "c_P", "c_B"} & set(result.undetermined)
     assert not {"k_L", "A", "n"} & set(result.undetermined)
@@ -126,7 +126,7 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     assert not any("cut off" in w for w in identified(2).warnings)
     record = plant(2)[1].slice(0, 600)
     monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
-    monkeypatch.setattr("psa_casadi.identification.exchanges._LAST", 1)
+    monkeypatch.setattr("psa_casadi.identification.mechanics._LAST", 1)
     result = identify([record])
     assert result.warnings[0].startswith("The fit was cut off before it converged")
 

@@ -31,7 +31,7 @@ def test_the_response_is_exact_between_samples() -> None:
 
 @pytest.mark.parametrize("q", [1e-10, 0.9999999e-10, 1.0000001e-10])
 def test_equal_poles_are_no_singularity(q: float) -> None:
-    """Two critically damped pairs at one place, beside pairs a hair apart: the same response."""
+    """Two critically damped pairs at one place, against pairs a hair apart: the same response."""
     x, h = np.minimum(np.arange(600) / 3.0, 1.0), 1e-6
     theta = np.log([2e-5, 4e-5, 2e-5, q, 2e-5, q, 5.0])
     apart = np.log([2e-5, 4e-5, 2.2e-5, 1e-10, 2e-5, 0.9e-10, 5.0])

@@ -1,6 +1,7 @@
 """The paper's method: exact where its assumptions hold, and a sentence wherever they do not."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,17 +18,10 @@ from psa_casadi.identification.paper import (
     moment_coefficients,
     paper_method,
 )
-from psa_casadi.records import (
-    Record,
-    decaying_triangle,
-    multisine,
-    time_grid,
-    triangle,
-)
+from psa_casadi.records import Record, decaying_triangle, multisine, time_grid, triangle
 from tests.identification.paper_cases import (
     LEADING,
     LINEAR,
-    changed,
     closed_step,
     coefficients_of_values,
     compliance,
@@ -77,7 +71,7 @@ def test_moments_without_noise_and_with_a_little() -> None:
 
 @pytest.mark.parametrize("name", PAPER_STACKS)
 def test_factors_reproduce_the_coefficients(name: str) -> None:
-    """The poles do not tell which part is which, but all six coefficients come back."""
+    """The poles do not show which part is which, but all six coefficients come back."""
     p = values(name)
     exact = coefficients_of_values(p)
     named = dict(zip(COEFFICIENTS, exact.tolist(), strict=True))
@@ -167,7 +161,7 @@ def test_steps_and_loops_are_told_by_their_voltage() -> None:
 def _gap() -> Record:
     x = np.array(loop().displacement)
     x[100:110] = np.nan
-    return changed(loop(), x)
+    return replace(loop(), displacement=x)
 
 
 def _late_loop() -> Record:
@@ -179,7 +173,7 @@ def _quiet(duration: float = 8e-3, samples: int = 40001, **changes: float) -> Re
     return closed_step(values(STACK, **LINEAR, **changes), duration, samples)
 
 
-#: What is given, and what must be said of it.
+#: Records, and the sentence on them.
 FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
     "no step": (lambda: [loop()], "No record is a step"),
     "no loop": (lambda: [_quiet()], "No record is a loop"),
@@ -234,17 +228,8 @@ def test_nothing_is_said_against_a_step_that_serves() -> None:
     assert not any(
         "not to be trusted" in s or "no stack's" in s for s in paper_identification.sentences
     )
-    assert set(paper_identification.found) >= {
-        "k_L",
-        "A",
-        "beta",
-        "gamma",
-        "delta",
-        "n",
-        "tau",
-        "m_B",
-        "c_B",
-    }
+    names = {"k_L", "A", "beta", "gamma", "delta", "n", "tau", "m_B", "c_B"}
+    assert set(paper_identification.identified) >= names
 
 
 def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +237,7 @@ def test_a_hysteresis_that_runs_away_is_set_back(monkeypatch: pytest.MonkeyPatch
     wild = real.model.with_values({"beta": -2e3, "gamma": 0.0, "A": -50.0, "n": 4.0})
     monkeypatch.setattr(
         "psa_casadi.identification.paper.paper_method",
-        lambda records, stiffness: type(real)(**{**vars(real), "model": wild}),
+        lambda *_, **__: replace(real, model=wild),
     )
     stack_identification = identify_by_paper([loop()])
     assert "cannot be simulated on the records" in stack_identification.warnings[-1]

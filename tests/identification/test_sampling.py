@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.sampling import even_clock, smooth_between
+from psa_casadi.identification.inputs import even_clock, smooth_between
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole

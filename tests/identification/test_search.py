@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from psa_casadi.identification.exchanges import exchanges
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
+from psa_casadi.identification.mechanics import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from psa_casadi.units import FloatArray
@@ -27,7 +27,7 @@ def truth(name: str) -> dict[str, float]:
 
 @slow
 def test_a_stack_is_found_from_its_records_alone() -> None:
-    """Step, loops and multisine of the reference with 0.1 % noise; no start is given."""
+    """Step, loops and multisine of the reference with 0.1 % noise, without a start."""
     run = one_run("PTBS200", 3)
     assert run.converged
     assert run.rms_ratio == pytest.approx(1.0, abs=0.05)
@@ -65,7 +65,7 @@ def _response(p: dict[str, float], frequency: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize(("part", "other"), ["PB", "BP"])
 def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
-    """With a creep lag that cancels the zero, the oscillator's slow pole is all that is seen."""
+    """With a creep lag that cancels the zero, the oscillator's slow pole is all that shows."""
     p = truth("demo")
     p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
     slow, what = {**p, "tau": 1e-3 * 3e8 / 3.5e8}, {"P": "wafers", "B": "bonding layers"}[part]
@@ -86,7 +86,7 @@ def loops() -> list[Record]:
 
 
 @pytest.fixture(scope="module")
-def found() -> StackIdentification:
+def identification() -> StackIdentification:
     return identify(loops())
 
 
@@ -101,14 +101,14 @@ def test_every_record_has_its_own_noise_level() -> None:
     assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
-def test_what_loops_leave_open_is_told_in_words(found: StackIdentification) -> None:
-    assert found.fit.converged
+def test_what_loops_leave_open_is_told_in_words(identification: StackIdentification) -> None:
+    assert identification.fit.converged
     lags = {"tau", "R_s", "c_P", "c_B"}
-    assert lags & set(found.determinacy.undetermined)
-    assert any("determined by these records" in w for w in found.warnings)
-    assert any(lags & set(c.parameters) for c in found.combinations)
-    assert any("step" in a.sentence or "multisine" in a.sentence for a in found.advice)
-    assert any(s.agrees for s in found.starts)
+    assert lags & set(identification.determinacy.undetermined)
+    assert any("determined by these records" in w for w in identification.warnings)
+    assert any(lags & set(c.parameters) for c in identification.combinations)
+    assert any("step" in a.sentence or "multisine" in a.sentence for a in identification.advice)
+    assert any(s.agrees for s in identification.starts)
 
 
 def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,7 +137,7 @@ def test_an_interrupt_keeps_the_best_fit_so_far(monkeypatch: pytest.MonkeyPatch)
     assert threading.active_count() < 20
 
 
-def test_drop_outs_and_outliers_do_not_move_the_fit(found: StackIdentification) -> None:
+def test_drop_outs_and_outliers_do_not_move_the_fit(identification: StackIdentification) -> None:
     spoiled = []
     for k, r in enumerate(loops()):
         y = np.array(r.displacement)
@@ -148,6 +148,6 @@ def test_drop_outs_and_outliers_do_not_move_the_fit(found: StackIdentification) 
     again = identify(spoiled)
     assert any("masked" in s for s in again.sentences)
     for name in ("k_L", "A", "n"):
-        error = found.determinacy.standard_errors[name]
-        assert abs(again.model.values[name] - found.model.values[name]) < 3.0 * error
-    assert again.fit.rms == pytest.approx(found.fit.rms, rel=0.05)
+        error = identification.determinacy.standard_errors[name]
+        assert abs(again.model.values[name] - identification.model.values[name]) < 3.0 * error
+    assert again.fit.rms == pytest.approx(identification.fit.rms, rel=0.05)

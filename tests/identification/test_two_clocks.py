@@ -1,4 +1,4 @@
-"""Two clocks: their saw tooth is found in plain NumPy records, undone, and seen nowhere else."""
+"""Two clocks: their saw tooth is detected in NumPy records, undone, and shows nowhere else."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -85,7 +85,7 @@ def test_the_finding_is_told_and_repeats(run: Run) -> None:
 
 
 def test_the_measured_sine_has_two_clocks(measured_data: Path) -> None:
-    """As docs/evidence.md states it; the minor loops show too little of it to be told."""
+    """As docs/evidence.md states it; the minor loops show too little of it."""
     sine, loops = (
         read_record(measured_data / "micromanipulator" / f"{name}.csv")
         for name in ("sine_1hz", "minor_loops")

@@ -12,7 +12,7 @@ import pytest
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.model_file import dumps
-from psa_casadi.population.finding import Finding, Found, replayed
+from psa_casadi.population.finding import Estimate, Finding, replayed
 from psa_casadi.population.population import population
 from psa_casadi.report.documents.files import identification_file
 from psa_casadi.report.documents.findings import read_findings
@@ -30,7 +30,7 @@ HOSTILE = "<img src=x onerror=alert(1)>&<b>bold</b>"
 
 
 def finding(name: str, k_l: float, **more: Any) -> Finding:
-    table = {"k_L": Found(k_l, "N/V", (0.99 * k_l, 1.01 * k_l), meaning="linear force per volt")}
+    table = {"k_L": Estimate(k_l, "N/V", (0.99 * k_l, 1.01 * k_l), meaning="linear force per volt")}
     return Finding(
         name, "identification", table, (("r", name),), rms_m=2e-9, rms_percent=0.02, **more
     )
@@ -38,7 +38,7 @@ def finding(name: str, k_l: float, **more: Any) -> Finding:
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Return the files of two diagnoses: one named a cause, one found nothing."""
+    """Return the files of two diagnoses: one named a cause, one names none."""
     folder = tmp_path_factory.mktemp("diagnoses")
     before, after = folder / "before.json", folder / "after.json"
     before.write_text(diagnosis("cause_named").to_json(), encoding="utf-8")
@@ -92,17 +92,17 @@ def test_a_page_has_not_too_many_devices(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "message"),
     [
         ("[]", "is no file of a diagnosis, identification or model"),
         ('{"format": "psa_casadi.diagnosis/1"}', "'verdict' is missing"),
         ("{", "is not JSON"),
     ],
 )
-def test_files_that_are_none_are_told(content: str, told: str, tmp_path: Path) -> None:
+def test_files_that_are_none_are_told(content: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(content)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=message):
         read_findings([path])
 
 
@@ -122,7 +122,7 @@ def test_values_that_do_not_belong_are_told_with_their_place(
 
 
 def devices() -> list[Finding]:
-    """Return forty devices of two batches over two years: one stands out, one batch is strong."""
+    """Return forty devices of two batches over two years: an outlier, and a strong batch."""
     rng = np.random.default_rng(4)
     sizes = 7.0 * np.exp(0.01 * rng.standard_normal(40))
     sizes[20:] *= 1.04
@@ -133,7 +133,7 @@ def devices() -> list[Finding]:
             f"d{k}", size, batch="A" if k < 20 else "B", day=date(2024 + k // 20, 1 + k % 12, 1)
         )
         tau = 1e-3 * float(np.exp(0.02 * rng.standard_normal()))
-        more = {"tau": Found(tau, "s", (0.98 * tau, 1.02 * tau), meaning="lag")}
+        more = {"tau": Estimate(tau, "s", (0.98 * tau, 1.02 * tau), meaning="lag")}
         items.append(replace(item, parameters={**item.parameters, **more}))
     return items
 
@@ -171,15 +171,15 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     named = {x: name for xs, names in marks for x, name in zip(xs, names, strict=True)}
     assert [named[k] for k in axis["tickvals"]] == axis["ticktext"]
     assert set(axis["ticktext"]) == {f"d{k}" for k in range(6)}
-    # found in this parameter by itself, and not among all tests
-    assert spread.far.found.sum() == 1
+    # significant in this parameter by itself, and not among all tests
+    assert spread.far.outlying.sum() == 1
     (only,) = spread_plot(replace(result, outliers=()), spread).data
     assert (only["name"], len(only["x"])) == ("belongs to the others", 40)
 
 
 def test_a_population_says_whose_fits_miss_their_records() -> None:
     assert missed_sentences(devices()) == ()
-    items = [replace(f, missed=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
+    items = [replace(f, noise_ratio=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
     (statement,) = missed_sentences(items)
     assert statement in population_sentences(population(items))
     assert "The fits of d7 (9.0 times the noise), d6" in statement

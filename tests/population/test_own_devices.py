@@ -1,4 +1,4 @@
-"""Devices that are no stacks: identifications and diagnoses of one's own model side by side."""
+"""Devices that are no stacks: identifications and diagnoses of any model side by side."""
 
 import json
 from dataclasses import replace
@@ -60,8 +60,8 @@ def test_a_fit_that_misses_its_record_is_told(tmp_path: Path) -> None:
     compared = psa.compare(*results)
     oiled, dry = compared.findings
     worst = max(rms / results[1].noise[name] for name, rms in results[1].rms.items())
-    assert (oiled.missed, oiled.warnings) == (None, ())
-    assert dry.missed == pytest.approx(worst, rel=0.05)
+    assert (oiled.noise_ratio, oiled.warnings) == (None, ())
+    assert dry.noise_ratio == pytest.approx(worst, rel=0.05)
     assert "The fit of dry (" in compared.sentence
     assert "misses its records" in repr(compared)
     compared.report(tmp_path / "page.html")
@@ -70,7 +70,7 @@ def test_a_fit_that_misses_its_record_is_told(tmp_path: Path) -> None:
     assert "dry: 'w' is missed by" in page.text
     assert "dry: 'i' is missed by" in page.text
     rows = [finding_content(f) for f in compared.findings]
-    assert [r["missed [times the noise]"] for r in rows] == [None, dry.missed]
+    assert [r["missed [times the noise]"] for r in rows] == [None, dry.noise_ratio]
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize, stats
 
 from psa_casadi.errors import InputError
-from psa_casadi.population.finding import Finding, Found
+from psa_casadi.population.finding import Estimate, Finding
 from psa_casadi.population.population import differences, frequencies, population
 from psa_casadi.population.statistics import adjusted, batch_test, drift, mixed_regression, outliers
 from psa_casadi.units import FloatArray
@@ -72,8 +72,8 @@ def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
         fit = mixed_regression(y, s)
         tau_in += fit.tau_interval[0] <= tau <= fit.tau_interval[1]
         mean_in += fit.interval()[0] <= 3.0 <= fit.interval()[1]
-        alarms += k < 300 and bool(outliers(y, s).found.any())
-    assert 0.925 < tau_in / rounds < (0.97 if tau else 0.99)  # at 0 one end is never missed
+        alarms += k < 300 and bool(outliers(y, s).outlying.any())
+    assert 0.925 < tau_in / rounds < (0.97 if tau else 0.99)  # at 0 one end always covers
     assert 0.925 < mean_in / rounds < 0.985
     assert alarms / 300 < 0.09  # 5 % are meant
 
@@ -95,7 +95,7 @@ def test_outliers_do_not_hide_each_other() -> None:
     y = rng.standard_normal(60) + s * rng.standard_normal(60)
     y[[3, 17, 40]] += [9.0, 10.0, -11.0]
     result = outliers(y, s)
-    assert set(np.flatnonzero(result.found)) == {3, 17, 40}
+    assert set(np.flatnonzero(result.outlying)) == {3, 17, 40}
 
 
 def test_p_values_are_adjusted_as_defined() -> None:
@@ -141,10 +141,10 @@ def test_errors_that_are_none_are_refused(errors: tuple[float, ...]) -> None:
 
 
 def finding(name: str, k_l: float, half: float, **more: Any) -> Finding:
-    """Return a device with one parameter that is told and one that is not."""
+    """Return a device with one parameter that is determined and one that is not."""
     table = {
-        "k_L": Found(k_l, "N/V", (k_l * np.exp(-half), k_l * np.exp(half))),
-        "tau": Found(1e-3, "s", (1e-9, 1.0), told=False),
+        "k_L": Estimate(k_l, "N/V", (k_l * np.exp(-half), k_l * np.exp(half))),
+        "tau": Estimate(1e-3, "s", (1e-9, 1.0), determined=False),
     }
     return Finding(name, "identification", table, **more)
 

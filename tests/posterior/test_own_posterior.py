@@ -1,4 +1,4 @@
-"""Posteriors of a model of one's own: several records and outputs, truths that are known."""
+"""Posteriors of any model: several records and outputs, truths that are known."""
 
 import json
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_the_gradient_is_that_of_the_density() -> None:
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path) -> None:
-    """The records tell so much that the posterior is nearly normal."""
+    """With so much data the posterior is nearly normal."""
     arviz = pytest.importorskip("arviz")
     held = []
     for seed in (1, 3):

@@ -34,13 +34,13 @@ def coordinates(model: Model, sets: dict[str, dict[str, float]], chosen: str) ->
     return np.array(np.where(log, np.log(rows / mean), rows / mean - 1.0))
 
 
-def found(model: Model, samples: int) -> dict[str, dict[str, float]]:
+def sets_of(model: Model, samples: int) -> dict[str, dict[str, float]]:
     return {n: dict(v) for n, v in posterior_sets(model, samples).items()}
 
 
 def test_sigma_points_have_the_covariance() -> None:
     model = spread((0.02, 0.05, 0.03), 0.7)
-    sets = found(model, 1)
+    sets = sets_of(model, 1)
     assert sets["mean"] == {n: model.values[n] for n in NAMES}
     plus, minus = (
         coordinates(
@@ -57,7 +57,7 @@ def test_sigma_points_have_the_covariance() -> None:
 
 def test_samples_have_the_covariance() -> None:
     model = spread((0.02, 0.05, 0.03), 0.7)
-    rows = coordinates(model, found(model, 900), "sample")
+    rows = coordinates(model, sets_of(model, 900), "sample")
     assert len(rows) == 900
     np.testing.assert_allclose(np.std(rows, axis=0), [0.02, 0.05, 0.03], rtol=0.08)
     assert abs(np.corrcoef(rows.T)[0, 1] - 0.7) < 0.05
@@ -83,7 +83,7 @@ def test_a_covariance_that_overflows_gives_no_values_that_are_none() -> None:
 
 def test_a_value_without_spread_stays() -> None:
     model = spread((0.02, 0.05, 0.0), 1.0)  # two that are one, and one that is known
-    sets = found(model, 5)
+    sets = sets_of(model, 5)
     assert all(abs(v["A"] / model.values["A"] - 1.0) < 1e-6 for v in sets.values())
     rows = coordinates(model, sets, "sample")
     np.testing.assert_allclose(rows[:, 1] / rows[:, 0], 2.5, rtol=0.1)
@@ -91,6 +91,6 @@ def test_a_value_without_spread_stays() -> None:
 
 def test_the_same_model_gives_the_same_sets() -> None:
     model = spread((0.02, 0.05, 0.03), 0.2)
-    assert found(model, 12) == found(model, 12)
-    assert list(found(model, 12).items())[:10] == list(found(model, 3).items())[:10]
+    assert sets_of(model, 12) == sets_of(model, 12)
+    assert list(sets_of(model, 12).items())[:10] == list(sets_of(model, 3).items())[:10]
     assert posterior_sets(stack_model("demo"), 20) == {}

@@ -53,7 +53,7 @@ def test_a_normal_posterior_is_found() -> None:
     theta = np.array([density.theta(u) for u in result.u.reshape(-1, 3)])
     covariance = np.linalg.inv(slopes.T @ slopes + np.diag(prior**-2.0))
     mean, spread = covariance @ slopes.T @ y, np.sqrt(np.diag(covariance))
-    # five standard errors of so many independent draws; the chains are worth no less
+    # five standard errors of that many independent draws; the chains have no fewer
     np.testing.assert_allclose((theta.mean(axis=0) - mean) / spread, 0.0, atol=5.0 / 1000**0.5)
     np.testing.assert_allclose(theta.std(axis=0) / spread, 1.0, atol=5.0 / 2000**0.5)
     assert result.divergences == 0
@@ -138,7 +138,7 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
     fitted = task().unknowns.values(task().theta)
     for name, f in content["parameters"].items():
         assert abs(f["mean"] - TRUTH.values[name]) < 4.0 * f["sd"], name
-        # the posterior is nearly normal: its mean is the fit's, but for the chains' own error
+        # the posterior is nearly normal: its mean is the fit's, but for the chains' error
         assert abs(f["mean"] - fitted[name]) < 5.0 * f["mc_error"] + 0.1 * f["sd"], name
     tree = arviz.from_netcdf(out)
     assert {"posterior", "sample_stats", "prior", "prior_predictive", "posterior_predictive"} < set(

@@ -57,8 +57,7 @@ from psa_casadi.identification.fitting.prediction import OUTPUT, trace_record
 from psa_casadi.identification.fitting.unknowns import (
     Unknowns,
     coordinates_of,
-    memory_priors,
-    memory_sizes,
+    memory_starts,
     unknowns_of,
 )
 from psa_casadi.model.compose import Model
@@ -146,8 +145,7 @@ class Rival:
     def starts(self) -> Mapping[str, tuple[float, float]]:
         """Size and prior width of every initial state that a new record leaves open."""
         if is_stack(self.model):
-            memories = zip(memory_sizes(self.model).items(), memory_priors(self.model), strict=True)
-            return {name: (size, prior) for (name, size), prior in memories}
+            return memory_starts(self.model)
         planned: Any = Signals(name="planned", time=np.arange(8.0), columns={})
         new = replace(whole(planned), known_start=self.known_start, channels=(_NOTHING,))
         unknowns = unknowns_around(self.model, (), [new], [1.0], placed=self.model)

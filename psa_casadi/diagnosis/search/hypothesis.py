@@ -149,7 +149,7 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        displayed = tuple(fit.shown(experiments))
+        displayed = tuple(fit.predicted_channels(experiments))
     except PsaError:
         return None
     rows, colours = [], []

@@ -26,7 +26,7 @@ from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Shaken, modes_of
+from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Response, modes_of
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
@@ -66,7 +66,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
         except PsaError:
             return None
         left = measured(e.record)[part] - before.predicted[k][part]
-        shaken.append(Shaken(drive[part], left, e.used[part], e.record.sample_time))
+        shaken.append(Response(e.record.sample_time, drive[part], left, e.used[part]))
         free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
     fit, states = before.fit, tuple(before.fit.starts())

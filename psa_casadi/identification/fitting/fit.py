@@ -1,15 +1,15 @@
 """Prediction-error fit: maximum likelihood of all records at once, with analytic derivatives.
 
-Where records begin that are held out whole, of which no fit sees a sample.
+Initial states of records that are held out whole, of which the fit uses no sample.
 
-The stack begins as in the fitted records of the device that begin at the same voltage: what the
-first tenth of a record tells of its memories is mostly the model's own error there. A loop that is
-simulated from it drifts off by a tenth of the range, where one that begins as the device's other
-records do stays within a hundredth. Where no fitted record begins alike, the first tenth finds the
-whole start. States of drive, sensor and environment belong to the record, and the first tenth finds
-them, too; but it hardly tells a charge that leaks slowly from the sensor's offset, and what it
-leaves open grows along the record. So such a state is looked for within the size that it has where
-the fitted records begin which begin alike (their root mean square is its prior).
+The stack starts as in the fitted records of the device with the same first voltage: memories that
+are estimated from the first tenth of a record mostly contain the model's error there. A loop that
+is simulated from these drifts by a tenth of the range; one that starts as the device's other
+records do stays within a hundredth. Without a fitted record of that first voltage, all of the start
+is estimated from the first tenth. States of drive, sensor and environment belong to the record and
+are estimated from its first tenth, too. That hardly separates a charge that leaks slowly from the
+sensor's offset, and the error grows along the record. So the prior of such a state has the root
+mean square that it has at the start of these fitted records.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,13 +20,6 @@ from functools import cached_property
 import numpy as np
 
 from psa_casadi.errors import InputError, PsaError
-from psa_casadi.identification.fitting.further import (
-    Further,
-    further_of,
-    predicted_further,
-    scaled,
-    span_of,
-)
 from psa_casadi.identification.fitting.levenberg_marquardt import (
     FIRST_RADIUS,
     LEAST_RADIUS,
@@ -34,12 +27,17 @@ from psa_casadi.identification.fitting.levenberg_marquardt import (
     minimise,
 )
 from psa_casadi.identification.fitting.prediction import (
+    Further,
     Prediction,
     Simulated,
+    further_of,
     measured,
     motions_of,
     predict,
+    predicted_further,
+    scaled,
     simulated,
+    span_of,
     trace_record,
 )
 from psa_casadi.identification.fitting.unknowns import (
@@ -68,7 +66,7 @@ _LEAST = 1e-6
 _EVALUATIONS, _TOLERANCE = 30, 1e-5
 
 
-def beginnings(
+def held_out_starts(
     model: Model,
     unknowns: Unknowns,
     theta: FloatArray,
@@ -78,39 +76,38 @@ def beginnings(
 ) -> FloatArray:
     """Return theta with start and offset of the records that are held out whole; others stay.
 
-    `model` has the values of theta; `levels` are those of white noise which tells as little as what
-    the model misses, of the channels without factors. Raises PsaError where a record cannot be
-    simulated.
+    `model` has the values of theta; `levels` are the equivalent white-noise standard deviations of
+    the residuals of the channels without factors. Raises PsaError if a record cannot be simulated.
     """
-    paths = theta.copy()
-    item = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
+    result = theta.copy()
+    outside = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
     for k, experiment in enumerate(experiments):
         if not experiment.held_out_whole or not experiment.known.any():
             continue
         first, last = unknowns.first(k), unknowns.first(k + 1)
-        paths[first:last] = 0.0
-        output = _told(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
-        shared = {c: output[c] for c in output if unknowns.started[k][c - first] not in item}
-        paths[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+        result[first:last] = 0.0
+        others = _like_starts(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
+        shared = {c: v for c, v in others.items() if unknowns.started[k][c - first] not in outside}
+        result[list(shared)] = [float(np.mean(v)) for v in shared.values()]
         sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
-        for c in sizes.keys() & output.keys():
-            size = float(np.sqrt(np.mean(np.square(output[c]))))
+        for c in sizes.keys() & others.keys():
+            size = float(np.sqrt(np.mean(np.square(others[c]))))
             sizes[c] = min(sizes[c], max(size, _LEAST))
-        paths[list(sizes)] = _sought(model, unknowns, paths, experiment, k, levels, sizes, way)
-    return paths
+        result[list(sizes)] = _fit_start(model, unknowns, result, experiment, k, levels, sizes, way)
+    return result
 
 
-def _told(
+def _like_starts(
     unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
 ) -> dict[int, list[float]]:
-    """Return what the fitted records that begin as record k does tell of its start's coordinates.
+    """Return the start's coordinates of the fitted records with the first voltage of record k.
 
-    One value for each of these records, by the coordinate's place.
+    One value for each of these records, by the index of record k's coordinate.
     """
     first = unknowns.first(k)
     size = max(float(np.ptp(e.record.voltage)) for e in experiments)
     starts = unknowns.first_voltage
-    items = [
+    like = [
         j
         for j, other in enumerate(experiments)
         if not other.held_out_whole and abs(starts[j] - starts[k]) <= _SAME * size
@@ -118,7 +115,7 @@ def _told(
     table = {
         first + place: [
             float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
-            for j in items
+            for j in like
             if name in unknowns.started[j]
         ]
         for place, name in enumerate(unknowns.started[k])
@@ -126,7 +123,7 @@ def _told(
     return {c: values for c, values in table.items() if values}
 
 
-def _sought(
+def _fit_start(
     model: Model,
     unknowns: Unknowns,
     theta: FloatArray,
@@ -158,8 +155,8 @@ def _sought(
         misfit, slopes = [], []
         for i, (j, known, weight) in enumerate(zip(plain, at, weights, strict=True)):
             offset, moves = (unknowns.offset(there, k), by_offset) if j == 0 else (0.0, 0.0)
-            displayed = run.y[known[:stop], i] + offset
-            misfit.append((displayed - experiment.measured(j)[known]) / weight)
+            predicted = run.y[known[:stop], i] + offset
+            misfit.append((predicted - experiment.measured(j)[known]) / weight)
             slopes.append(
                 (run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight
             )
@@ -179,7 +176,7 @@ def _sought(
 #: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
 #: then the stepper is taken.
 _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
-#: Multiple of the whole range that is missed (rms) where a loop has diverged. It would come down by
+#: Rms residual over the range at which a loop has diverged. It would come down by
 #: decades a step, each of which takes a hundred times as long as one of a loop that is stable.
 _DIVERGED = 1e6
 
@@ -198,7 +195,7 @@ def accurate_minimum(
     radius: float = FIRST_RADIUS,
     patient: bool = False,
 ) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, found by a simulation that is accurate there, and how that was done.
+    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's.
 
     See `minimise` for how far it is sought.
     """
@@ -236,26 +233,24 @@ def accurate_minimum(
                 raise
             current_work().stop()
             minimum, rougher = before
-            ended = replace(minimum, evaluations=spent, interrupted=True, converged=False)
-            return ended, rougher, []
+            return replace(minimum, interrupted=True, converged=False), rougher, []
         if result is None:
             raise SimulationError(
                 "The model cannot be simulated at the start of the fit; start from other values."
                 f" {evaluate.refused}".rstrip()
             )
-        minimum, theta = result, result.theta
-        before = minimum, way
         spent += result.evaluations
+        minimum, theta = replace(result, evaluations=spent), result.theta
+        before = minimum, way
         if minimum.interrupted:  # whoever interrupts waits neither for the error nor for more
             current_work().stop()
-            return replace(minimum, evaluations=spent), way, []
-        if minimum.cost > goal:  # of no use, however accurate
-            return replace(minimum, evaluations=spent), way, []
-        output = simulated(model, experiments, unknowns, theta, way=way)
-        pairs_of = zip(output, allowed, strict=True)
-        if not any(e > a for t, item in pairs_of for e, a in zip(t.errors, item, strict=False)):
+        if minimum.interrupted or minimum.cost > goal:  # of no use, however accurate
+            return minimum, way, []
+        runs = simulated(model, experiments, unknowns, theta, way=way)
+        pairs_of = zip(runs, allowed, strict=True)
+        if not any(e > a for r, most in pairs_of for e, a in zip(r.errors, most, strict=False)):
             break
-    return replace(minimum, evaluations=spent), way, output
+    return minimum, way, runs
 
 
 def _readings(e: Experiment, channel: int) -> FloatArray:
@@ -276,7 +271,7 @@ class Objective:
     ) -> None:  # fmt: skip
         self._of, self._way = (model, tuple(experiments), unknowns), way
         self._target = np.concatenate([_readings(e, 0) for e in experiments])
-        shares = shares_of(experiments)
+        shares = weights_of(experiments, [e.share(0) for e in experiments])
         weights, span = weights_of(experiments, sigma) * shares, float(np.ptp(self._target))
         self._reach = float(np.max(span / weights)) if span > 0.0 else np.inf
         self._used = [e.at(0)[: e.stop] for e in experiments]
@@ -315,13 +310,11 @@ class Objective:
 
 
 def weights_of(experiments: Sequence[Experiment], sigma: Sequence[float]) -> FloatArray:
-    """Return the level that weights each used sample of the first channel (n,)."""
+    """Return a figure of every record, such as its level, at each used sample of the first channel.
+
+    Shape (n,), all records stacked.
+    """
     return np.repeat(np.asarray(sigma, dtype=np.float64), _counts(experiments))
-
-
-def shares_of(experiments: Sequence[Experiment]) -> FloatArray:
-    """Return the share of the noise of each used sample of the first channel (n,)."""
-    return np.repeat(np.array([e.share(0) for e in experiments]), _counts(experiments))
 
 
 def _counts(experiments: Sequence[Experiment]) -> list[int]:
@@ -340,11 +333,11 @@ class Fit:
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
     `sigma` the noise level that weighted each record [m]; `cost` the weighted sum of squares with
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
-    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` tells how
+    keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` holds how
     each record was run and how accurately; it is empty after an interrupt, and above the goal.
     `radius` is that of the next step. The residuals are those of the first `channel`, `lengths`
     (records,) of each record and `spread` the range of its readings; `further` are the fits of the
-    channels beside it. Of any model read displacement as its first channel, m as that one's unit.
+    other channels. Of any model read displacement as its first channel, m as that one's unit.
     """
 
     model: Model
@@ -383,9 +376,9 @@ class Fit:
     def data_cost(self) -> float:
         """The `cost` without its weak priors: the weighted sum of squares of the records alone.
 
-        Priors count from the model that a fit was given, so they add (ln ratio / spread)^2 to a
-        lag's fit that began elsewhere, 49 for a factor e^7, and nothing where it is begun again.
-        Fits of one search, which begin in different places, are compared by this.
+        Priors are centred at the model that a fit starts from, so they add (ln ratio / spread)^2
+        for a lag that started elsewhere, 49 for a factor e^7, and nothing after a restart there.
+        Fits of one search, which start from different values, are compared by this.
         """
         return self.cost - float(np.sum((self.theta / self.unknowns.prior) ** 2))
 
@@ -425,20 +418,20 @@ class Fit:
     ) -> list[Prediction]:
         """Predict whole records with their derivatives by theta, if `differentiated`.
 
-        The outputs of `further` channels come too if they are asked for.
+        With `further`, the outputs of the further channels as well.
         """
         return predict(
             self.model, experiments, self.unknowns, self.placed(experiments),
             way=self.way, everything=True, differentiated=differentiated, further=further,
         )  # fmt: skip
 
-    def shown(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+    def predicted_channels(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict all channels over whole records (n, channels); nan where a record has none."""
         parts = self.predictions(experiments, differentiated=False, further=True)
-        items = [predicted_further(experiments, parts, f) for f in self.further]
+        further = [predicted_further(experiments, parts, f) for f in self.further]
         return [
             np.column_stack(
-                [p.displacement, *(item.get(k, np.full(e.record.n, np.nan)) for item in items)]
+                [p.displacement, *(f.get(k, np.full(e.record.n, np.nan)) for f in further)]
             )
             for k, (e, p) in enumerate(zip(experiments, parts, strict=True))
         ]
@@ -446,50 +439,47 @@ class Fit:
     def outputs(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
         """Predict all outputs of the model over whole records (n, ny), with sensors' offsets."""
         names, theta = self.model.output_names, self.placed(experiments)
-        whole = [replace(e, channels=(*e.channels, *map(_plain, names))) for e in experiments]
+        every = tuple(Channel(n, "", (n,), offset=False, factors=False) for n in names)
+        whole = [replace(e, channels=(*e.channels, *every)) for e in experiments]
         parts = predict(
             self.model, whole, self.unknowns, theta,
             way=self.way, everything=True, differentiated=False, further=True,
         )  # fmt: skip
-        items = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
+        outputs = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
         for channel in self.channels:
             k = names.index(channel.channel.outputs[0])
             if channel.number == 0:
-                for y, p in zip(items, parts, strict=True):
+                for y, p in zip(outputs, parts, strict=True):
                     y[:, k] = p.displacement
             elif not channel.channel.factors:
                 for r, y in predicted_further(experiments, parts, channel).items():
-                    items[r][:, k] = y
-        return items
+                    outputs[r][:, k] = y
+        return outputs
 
     def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
-        """Return theta with where held-out records begin (`beginnings`), which no fit has seen."""
+        """Return theta with the starts of held-out records (`held_out_starts`)."""
         plain = [c for c in self.channels if not c.channel.factors]
-        levels = [_doubt(c.residuals, c.rms) for c in plain]
-        return beginnings(self.model, self.unknowns, self.theta, experiments, levels, self.way)
+        levels = [_equivalent_noise(c.residuals, c.rms) for c in plain]
+        return held_out_starts(self.model, self.unknowns, self.theta, experiments, levels, self.way)
 
     @cached_property
     def channels(self) -> tuple[Further, ...]:
         """The fits of all channels, the first one foremost."""
-        output = tuple(k for k, n in enumerate(self.lengths) if n)
-        level = self.sigma[output[0] if output else 0]
+        records = tuple(k for k, n in enumerate(self.lengths) if n)
+        level = self.sigma[records[0] if records else 0]
         first = Further(
             channel=self.channel, number=0, level=level, spread=self.spread,
             residuals=self.residuals, jacobian=self.jacobian,
             basis=np.zeros((len(self.residuals), 0)), factors=np.ones(1),
-            lengths=tuple(self.lengths[k] for k in output), records=output,
+            lengths=tuple(self.lengths[k] for k in records), records=records,
         )  # fmt: skip
         return (first, *self.further)
 
 
-def _plain(name: str) -> Channel:
-    return Channel(name, "", (name,), offset=False, factors=False)
+def _equivalent_noise(left: FloatArray, rms: float) -> float:
+    """Return the equivalent white-noise standard deviation of a correlated residual.
 
-
-def _doubt(left: FloatArray, rms: float) -> float:
-    """Return the level of white noise that tells as little as what the model misses.
-
-    Samples that are alike count as one: rms sqrt((1 + r)/(1 - r)), r the correlation of neighbours.
+    It is rms sqrt((1 + r)/(1 - r)), r the correlation of neighbours.
     """
     power = float(left @ left)
     r = float(left[1:] @ left[:-1]) / power if power > 0.0 else 0.0
@@ -498,7 +488,7 @@ def _doubt(left: FloatArray, rms: float) -> float:
 
 
 @contextmanager
-def _overflow_is_told() -> Iterator[None]:
+def _overflow_as_simulation_error() -> Iterator[None]:
     try:
         yield
     except (ArithmeticError, np.linalg.LinAlgError) as error:
@@ -507,7 +497,7 @@ def _overflow_is_told() -> Iterator[None]:
         ) from error
 
 
-@_overflow_is_told()
+@_overflow_as_simulation_error()
 def fit(
     model: Model,
     experiments: Sequence[Experiment],
@@ -525,10 +515,10 @@ def fit(
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
-    Of the displacement and of the experiments' `further` columns, each by its own level.
+    Of the displacement and of the experiments' `further` columns, each weighted by its level.
     Minimises sum(((measured - predicted)/sigma)^2) + sum((theta/prior)^2) by Levenberg and
     Marquardt's method within the parameters' bounds; the coordinates and their weak priors are
-    those of `unknowns_of(model, ...)`, the search begins at `start`, and may end early where the
+    those of `unknowns_of(model, ...)`, the search starts at `start`, and may end early where the
     cost will stay above the `goal`; its first step is of the `radius`, and where it is `patient` it
     does not stop in a curved valley (`minimise`). Raises InputError when no sample can be used,
     SimulationError when the start cannot be simulated or its numbers overflow.
@@ -542,10 +532,10 @@ def fit(
     theta[: len(free)] = unknowns.coordinates(placed.values)
     for r, e in enumerate(experiments):
         if e.used.any():  # the offset's coordinate is linear: `minimise` puts it where it is best
-            displayed = _readings(e, 0) if e.channels[0].offset else np.zeros(1)
-            offset = float(np.mean(displayed)) if displayed.size else 0.0
+            readings = _readings(e, 0) if e.channels[0].offset else np.zeros(0)
+            offset = float(np.mean(readings)) if readings.size else 0.0
             unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
-    minimum, way, output = accurate_minimum(
+    minimum, way, runs = accurate_minimum(
         model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
         rtol=rtol, goal=goal, radius=radius, patient=patient,
     )  # fmt: skip
@@ -554,9 +544,9 @@ def fit(
     if experiments[0].further:
         parts = predict(model, experiments, unknowns, minimum.theta, way=way, further=True)
         further = further_of(experiments, parts)
-    result, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
+    fitted_model, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
-        model=result,
+        model=fitted_model,
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -567,7 +557,7 @@ def fit(
         interrupted=minimum.interrupted,
         evaluations=minimum.evaluations,
         way=way,
-        simulated=tuple(output),
+        simulated=tuple(runs),
         radius=minimum.radius,
         further=further,
         channel=experiments[0].channels[0],
@@ -580,7 +570,7 @@ def unknowns_around(
     model: Model, free: Sequence[str], experiments: Sequence[Experiment], sigma: Sequence[float],
     *, placed: Model,
 ) -> Unknowns:  # fmt: skip
-    """Return the coordinates of a fit around a model's values, `placed` where it begins.
+    """Return the coordinates of a fit around a model's values; `placed` has the start's values.
 
     Of any model but a stack per experiment the initial states as deviations from the declared
     starts (unless these are known) over their usual sizes, with weak priors: `LINEAR_PRIOR` of

@@ -16,7 +16,7 @@ from psa_casadi.units import FloatArray
 #: theta -> (residual (m,), Jacobian (m, k)), or None where the model cannot be evaluated.
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]
 
-#: Of a fit that begins, and at least of one that goes on.
+#: Radius of the first step of a fit, and the least one of a fit that continues.
 FIRST_RADIUS, LEAST_RADIUS = 1.0, 0.1
 _SMALLEST_RADIUS = 1e-6
 #: Where a step of any length promises more than this multiple of the tolerance, short steps are
@@ -62,8 +62,8 @@ def minimise(
 
     A point where the squares of r or J exceed double precision counts as one that cannot be.
 
-    Each step minimises |r + J step|^2 within a radius (Levenberg's damping, found by bisection;
-    Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first as given,
+    Each step minimises |r + J step|^2 within a radius (Levenberg's damping, by bisection;
+    Moré 1978) and the bounds, and is accepted if the cost falls; the radius, at first `radius`,
     follows the ratio of actual to predicted decrease.
     Converged when two steps in a row lower the cost by less than `tolerance` of it, or no radius
     lowers it at all. A keyboard interrupt ends the iteration at the best point so far.

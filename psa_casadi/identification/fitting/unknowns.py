@@ -14,11 +14,12 @@ from psa_casadi.variables import State, nominal_value
 LOG_PRIOR = 3.0
 LINEAR_PRIOR = 10.0
 #: Initial states with a memory, in usual sizes. One that settles is a mean of its past, and so lies
-#: within its usual range: wider, it would stand for a relaxation of each record's own.
+#: within its usual range: a wider prior would let it fit a relaxation in each record.
 MEMORY_PRIOR, SETTLING_PRIOR = 3.0, 1.0
 #: Initial states other than memories, in what a steady motion at the record's rates would change.
 MOTION_PRIOR = 30.0
-#: Lags beside the creep lag are alike in most records: each stays near its start unless told.
+#: The responses to lags other than the creep lag are similar: each stays near its start unless the
+#: records determine it.
 LAG_PRIOR = 1.0
 _LAGS = ("R_s", "c_P", "c_B", "c")
 _CARRIED = "f_H"
@@ -33,12 +34,12 @@ class Unknowns:
 
     theta = [parameters, then per record: initial states and the sensor's offset]. A parameter that
     spans decades is ln(value / reference), any other (value - reference) / scale. The loop's shape
-    (k_L, A, beta, gamma) has coordinates of its own where all four are free: with s = k_L + A, the
+    (k_L, A, beta, gamma) has joint coordinates where all four are free: with s = k_L + A, the
     slope just after a reversal, they are ln s, A_ref / A - 1, beta A / s and gamma A / s. A loop
     with weak bends fixes s and the two products, and hardly A itself; so its valley is straight
     here, and A without bound (Rayleigh's quadratic loop) lies at a finite distance.
     `started` names, per record, the states whose start is searched, as deviations from where the
-    record's first voltage and rate put them. Where the loop has its own coordinates, those of a
+    record's first voltage and rate put them. Where the loop has joint coordinates, those of a
     record's memory and offset are q_0 = f_H(0) / A and the offset plus C A (q_0 - v_0), with the
     first voltage v_0 and the static compliance C [m/N]: what follows keeps its place when A moves.
     `prior` holds the standard deviation of every coordinate's weak prior (infinite for offsets),
@@ -57,7 +58,7 @@ class Unknowns:
     compliance: float
     offset_scale: float
     prior: FloatArray
-    loop: tuple[int, ...] | None = None
+    loop: list[int] | None = None
 
     @property
     def records(self) -> int:
@@ -84,7 +85,7 @@ class Unknowns:
         log = np.exp(np.where(self.log, free, 0.0))
         value = np.where(self.log, self.reference * log, self.reference + free * self.scale)
         if self.loop is not None:
-            value[list(self.loop)] = self._loop_values(free[list(self.loop)])
+            value[self.loop] = self._loop_values(free[self.loop])
         value = np.clip(value, self.low, self.high)
         return dict(zip(self.names, value.tolist(), strict=True))
 
@@ -93,11 +94,10 @@ class Unknowns:
         value = np.array(list(self.values(theta).values()))
         matrix: FloatArray = np.diag(np.where(self.log, value, self.scale))
         if self.loop is not None:
-            where = list(self.loop)
-            k_l, a, beta, gamma = value[where]
+            k_l, a, beta, gamma = value[self.loop]
             s, step = k_l + a, _BEND_STEP * (k_l + a) / a
-            by_second = -a * a / float(self.reference[where[1]])
-            matrix[np.ix_(where, where)] = np.array(
+            by_second = -a * a / float(self.reference[self.loop[1]])
+            matrix[np.ix_(self.loop, self.loop)] = np.array(
                 [
                     [s, -by_second, 0.0, 0.0],
                     [0.0, by_second, 0.0, 0.0],
@@ -108,23 +108,19 @@ class Unknowns:
         return matrix
 
     def coordinates(self, values: Mapping[str, float]) -> FloatArray:
-        """Return the theta of the parameters (k,) at the given values.
+        """Return the theta of the parameters (k,) at these values.
 
         Raises PsaError for a loop that has no coordinates.
         """
         value = np.array([values[n] for n in self.names])
-        ratio = np.where(self.log, np.maximum(value, 1e-300), 1.0) / np.where(
-            self.log, self.reference, 1.0
-        )
-        theta: FloatArray = np.where(self.log, np.log(ratio), (value - self.reference) / self.scale)
+        theta = self._one_by_one(value)
         if self.loop is not None:
-            where = list(self.loop)
-            k_l, a, beta, gamma = value[where]
-            r_k, r_a, r_beta, r_gamma = self.reference[where]
+            k_l, a, beta, gamma = value[self.loop]
+            r_k, r_a, r_beta, r_gamma = self.reference[self.loop]
             if (k_l + a) / (r_k + r_a) <= 0.0:
                 raise PsaError("A loop whose displacement falls with the voltage cannot be fitted.")
             now, then = a / (k_l + a), r_a / (r_k + r_a)
-            theta[where] = [
+            theta[self.loop] = [
                 np.log((k_l + a) / (r_k + r_a)),
                 r_a / a - 1.0,
                 (beta * now - r_beta * then) / (_BEND_STEP * self._bend),
@@ -132,13 +128,19 @@ class Unknowns:
             ]
         return theta
 
+    def _one_by_one(self, value: FloatArray) -> FloatArray:
+        """Return the coordinates (k,) of values, each by itself: without those of the loop."""
+        positive = np.where(self.log, self.reference, 1.0)
+        ratio = np.where(self.log, np.maximum(value, 1e-300), 1.0) / positive
+        return np.where(self.log, np.log(ratio), (value - self.reference) / self.scale)
+
     @property
     def _bend(self) -> float:
         """Size of beta A / s in the reference, 0.1 k_L for an ordinary loop [N/V]."""
         return float(0.1 * self.reference[self.names.index("k_L")])
 
     def _loop_values(self, theta: FloatArray) -> list[float]:
-        k_l, a, beta, gamma = self.reference[list(self.loop or ())]
+        k_l, a, beta, gamma = self.reference[self.loop or []]
         s_new, a_new = (k_l + a) * np.exp(theta[0]), a / (1.0 + theta[1])
         bends = [q * a / (k_l + a) for q in (beta, gamma)]
         moved = [b + _BEND_STEP * self._bend * t for b, t in zip(bends, theta[2:], strict=True)]
@@ -215,21 +217,13 @@ class Unknowns:
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Return lower and upper bounds of theta."""
-        positive = np.where(self.log, self.reference, 1.0)
-        edges = [
-            np.where(
-                self.log,
-                np.log(np.maximum(edge, 1e-300) / positive),
-                (edge - self.reference) / self.scale,
-            )
-            for edge in (self.low, self.high)
-        ]
+        low, high = self._one_by_one(self.low), self._one_by_one(self.high)
         if self.loop is not None:
-            k_l, a, *_ = self.reference[list(self.loop)]
-            edges[0][list(self.loop)] = [-10.0, abs(a) / (_STEEPEST * (k_l + a)) - 1.0, -1e3, -1e3]
-            edges[1][list(self.loop)] = [10.0, 1e3, 1e3, 1e3]
+            k_l, a, *_ = self.reference[self.loop]
+            low[self.loop] = [-10.0, abs(a) / (_STEEPEST * (k_l + a)) - 1.0, -1e3, -1e3]
+            high[self.loop] = [10.0, 1e3, 1e3, 1e3]
         rest = np.full(self.size - len(self.names), np.inf)
-        return np.concatenate([edges[0], -rest]), np.concatenate([edges[1], rest])
+        return np.concatenate([low, -rest]), np.concatenate([high, rest])
 
 
 #: Of every record: sizes and prior widths of the starts that are searched, by the state's name.
@@ -245,22 +239,21 @@ def unknowns_of(
 ) -> Unknowns:
     """Set up the coordinates of a stack around a model's values.
 
-    `motions` names for every record the states beside the memories whose start is searched, each
+    `motions` names for every record the other states than memories whose start is searched, each
     with the size of an ordinary deviation, in the state's unit; `first_voltage` [V] is where each
     record starts.
     """
-    memories = dict(zip(memory_sizes(model).items(), memory_priors(model), strict=True))
-    table = {name: (size, prior) for (name, size), prior in memories.items()}
-    starts = [table | {n: (size, MOTION_PRIOR) for n, size in m.items()} for m in motions]
+    memories = memory_starts(model)
+    starts = [memories | {n: (size, MOTION_PRIOR) for n, size in m.items()} for m in motions]
     unknowns = coordinates_of(model, free, starts, offset_scale, np.inf)
     values, prior, log = model.values, unknowns.prior, unknowns.log
     prior[[k for k, n in enumerate(free) if n in _LAGS]] = LAG_PRIOR
     loop = None
     slope = values.get("k_L", 0.0) + values.get("A", 0.0)
     if all(n in free for n in _LOOP) and values["A"] != 0 and slope > 0:
-        loop = tuple(list(free).index(n) for n in _LOOP)
-        log[list(loop)] = False
-        prior[list(loop)] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
+        loop = [list(free).index(n) for n in _LOOP]
+        log[loop] = False
+        prior[loop] = [LOG_PRIOR, LOG_PRIOR, LINEAR_PRIOR, LINEAR_PRIOR]
     return replace(
         unknowns,
         first_voltage=tuple(first_voltage),
@@ -283,7 +276,7 @@ def coordinates_of(
     values: Mapping[str, float] = model.values
     parameters = [model.parameter(n) for n in free]
     log = np.array([p.log and values[p.name] > 0 for p in parameters], dtype=bool)
-    items = [np.array([prior for _, prior in s.values()] + [offset_prior]) for s in starts]
+    priors = [np.array([prior for _, prior in s.values()] + [offset_prior]) for s in starts]
     return Unknowns(
         names=tuple(free),
         started=tuple(tuple(s) for s in starts),
@@ -296,8 +289,13 @@ def coordinates_of(
         first_voltage=(),
         compliance=0.0,
         offset_scale=offset_scale,
-        prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *items]),
+        prior=np.concatenate([np.where(log, LOG_PRIOR, LINEAR_PRIOR), *priors]),
     )
+
+
+def within_bounds(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+    """Return values of some parameters, clipped to their bounds."""
+    return {n: float(np.clip(v, *model.parameter(n).bounds)) for n, v in values.items()}
 
 
 def static_compliance(values: Mapping[str, float]) -> float:
@@ -307,15 +305,13 @@ def static_compliance(values: Mapping[str, float]) -> float:
     return 1.0 / values["k"]
 
 
-def memory_sizes(model: Model) -> dict[str, float]:
-    """Return the usual size of every state whose start no voltage tells."""
-    states = model.structure.states
-    return {s.name: nominal_value(s.nominal, model.values) for s in states if s.memory}
-
-
-def memory_priors(model: Model) -> tuple[float, ...]:
-    """Return the standard deviations of the weak priors of these starts, in usual sizes."""
-    return tuple(memory_prior(s) for s in model.structure.states if s.memory)
+def memory_starts(model: Model) -> dict[str, tuple[float, float]]:
+    """Return usual size and `memory_prior` of every state whose start no voltage determines."""
+    return {
+        s.name: (nominal_value(s.nominal, model.values), memory_prior(s))
+        for s in model.structure.states
+        if s.memory
+    }
 
 
 def memory_prior(state: State) -> float:

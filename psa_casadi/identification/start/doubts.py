@@ -15,33 +15,21 @@ from psa_casadi.units import BoolArray, FloatArray
 #: Numbers whose squares would overflow.
 _LARGEST = 1e30
 
-_STUCK = (
-    "But for stuck readings, the displacement is one value: the sensor is out of its range, or"
-    " another column holds its readings (--columns displacement=...)."
-)
-_FEW = (
-    "Only {} of {} readings of the displacement count, too few for a fit, which needs {}; record"
-    " again, with the sensor in its range throughout."
-)
-_STILL = (
-    "The displacement is {:.6g} m throughout: the sensor is out of its range or was not connected,"
-    " or another column holds its readings (--columns displacement=...)."
-)
-_HARDLY = (
-    "Only {} readings of the displacement differ from {:.6g} m, too few for a fit, which needs {}:"
-    " the sensor is out of its range nearly throughout. Record again, with the sensor in its range."
-)
-_TWO = (
-    "The displacement has two values only, {:.6g} and {:.6g} m: that is a switch, or a sensor whose"
-    " step is as large as the motion, and nothing of a stack can be identified from it. Record it"
-    " with a finer sensor, or name another column (--columns displacement=...)."
-)
+
+def refuse_unreadable(records: Sequence[Record]) -> None:
+    """Raise InputError for a displacement that is still or wraps, or a time in another unit."""
+    refuse_still(records)
+    refuse_wrapped(records)
+    refuse_other_time(records)
 
 
 def refuse_stuck(records: Sequence[Record]) -> None:
     """Raise InputError where no displacement that counts changes."""
     if not any(r.mask.any() and r.range_m > 0.0 for r in records):
-        raise InputError([_STUCK])
+        raise InputError(
+            "But for stuck readings, the displacement is one value: the sensor is out of its range,"
+            " or another column holds its readings (--columns displacement=...)."
+        )
 
 
 def refuse_still(records: Sequence[Record]) -> None:
@@ -53,26 +41,45 @@ def refuse_still(records: Sequence[Record]) -> None:
         largest = max(float(np.max(np.abs(c), initial=0.0)) for c in columns)
         if largest > _LARGEST:
             raise InputError(
-                [f"The {name} reaches {largest:.2g}: that is no reading; correct the column."]
+                f"The {name} reaches {largest:.2g}: that is no reading; correct the column."
             )
     values = [np.unique(measured(r)[r.mask]) for r in records]
     if all(v.size <= 1 for v in values):
-        raise InputError([_STILL.format(values[0][0])])
+        raise InputError(
+            f"The displacement is {values[0][0]:.6g} m throughout: the sensor is out of its range"
+            " or was not connected, or another column holds its readings"
+            " (--columns displacement=...)."
+        )
     if all(v.size <= 2 for v in values):
-        raise InputError([_TWO.format(*max(values, key=np.ptp))])
+        low, high = max(values, key=np.ptp)
+        raise InputError(
+            f"The displacement has two values only, {low:.6g} and {high:.6g} m: that is a switch,"
+            " or a sensor whose step is as large as the motion, and nothing of a stack can be"
+            " identified from it. Record it with a finer sensor, or name another column"
+            " (--columns displacement=...)."
+        )
 
 
 def refuse_few(inputs: Sequence[Record], kept: Sequence[Record], texts: Sequence[str]) -> None:
     """Raise InputError where masking left hardly a reading; `texts` is what it was done for."""
     before, after = (sum(int(r.mask.sum()) for r in records) for records in (inputs, kept))
     if after < min(before, FEWEST_SAMPLES):
-        raise InputError([*texts, _FEW.format(after, before, FEWEST_SAMPLES)])
-    items = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
-    others = after - sum(int(counts.max()) for _, counts in items)
+        few = (
+            f"Only {after} of {before} readings of the displacement count, too few for a fit, which"
+            f" needs {FEWEST_SAMPLES}; record again, with the sensor in its range throughout."
+        )
+        raise InputError([*texts, few])
+    uniques = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
+    others = after - sum(int(counts.max()) for _, counts in uniques)
     if others < min(after, FEWEST_SAMPLES):
-        values, counts = max(items, key=lambda f: int(f[1].max()))  # the reading that is there most
-        usual = float(values[np.argmax(counts)])
-        raise InputError([*texts, _HARDLY.format(others, usual, FEWEST_SAMPLES)])
+        values, counts = max(uniques, key=lambda u: int(u[1].max()))
+        few = (
+            f"Only {others} readings of the displacement differ from"
+            f" {float(values[np.argmax(counts)]):.6g} m, too few for a fit, which needs"
+            f" {FEWEST_SAMPLES}: the sensor is out of its range nearly throughout. Record again,"
+            " with the sensor in its range."
+        )
+        raise InputError([*texts, few])
 
 
 #: The largest mean speed of a stack's end [m/s]. A bar of length L has its first resonance at
@@ -82,8 +89,8 @@ def refuse_few(inputs: Sequence[Record], kept: Sequence[Record], texts: Sequence
 FASTEST = 2.0
 #: A mean speed [m/s] that few tests have: strokes of 10 um at 5 kHz.
 _FAST = 0.1
-#: Largest stroke that counts for that [m]: of more, the displacement's unit is wrong. Where the
-#: sensor's scale is unknown, a chip's stroke [m/V] stands for it.
+#: Largest stroke that counts for that [m]: of more, the displacement's unit is wrong. If the
+#: sensor's scale is unknown, a chip's stroke [m/V] is taken.
 _STROKE, _CHIP = 2e-3, 1e-8
 #: Time [s] for the whole range of the voltage that counts as held: see `hold_rate`.
 SLOWEST = 1000.0
@@ -158,7 +165,7 @@ def _paces(record: Record) -> tuple[float, float]:
 
 
 def _advice(pace: float, powers: Sequence[int]) -> str:
-    """Return which unit of time, so many powers of ten from the given, makes a pace usual."""
+    """Return which unit of time, by one of the powers of ten, makes a pace usual."""
     low, high = _USUAL
     power = next((p for p in powers if low <= pace / 10.0**p <= high), powers[-1])
     right, wrong = _UNITS[power]
@@ -177,30 +184,16 @@ _TURNS = np.arange(0.02, 0.99, 0.02)
 #: Fewest wraps.
 _WRAPS = 2
 
-_WRAPPED = (
-    "Record '{}': the displacement jumps {} times by {:.4g} {}, up or down, and follows the voltage"
-    " without these jumps: the sensor, or its counter, begins again at the end of its range. Add"
-    " the jumps up (numpy.unwrap with period={:.4g}), or record with a larger range."
-)
-_OTHER = (
-    "Record '{}': the {} the displacement follows the voltage (correlation {:.3f}), the"
-    " displacement itself does not ({:.3f}): the column may hold {} it."
-)
-_TURNED = (
-    "Record '{}': with its sign turned below {:.4g} V the displacement follows the voltage"
-    " (correlation {:.3f}), as it is it does not ({:.3f}): it may be rectified."
-)
-
 
 def refuse_wrapped(records: Sequence[Record]) -> None:
-    """Raise InputError where a displacement begins again at the end of the sensor's range."""
+    """Raise InputError if a displacement wraps round at the end of the sensor's range."""
     problems = [s for r in records if (s := _wrapped(r))]
     if problems:
         raise InputError(problems)
 
 
 def _wrapped(record: Record) -> str:
-    """Say that all large steps of a displacement are alike, and that it is right without them."""
+    """Return a sentence if a displacement without its large, equal steps follows the voltage."""
     y, v = _readings(record)
     steps = np.diff(y)
     large = np.abs(steps) > _STEP * np.ptp(y)
@@ -216,19 +209,23 @@ def _wrapped(record: Record) -> str:
     if abs(_correlation(y + added, v)) < _FOLLOWS or abs(_correlation(y, v)) > _FOLLOWS:
         return ""
     scale, unit = (1e6, "um") if record.displacement_unit == "m" else (1.0, "counts")
-    count = int(np.count_nonzero(large))
-    return _WRAPPED.format(record.name, count, scale * period, unit, scale * period)
+    return (
+        f"Record '{record.name}': the displacement jumps {np.count_nonzero(large)} times by"
+        f" {scale * period:.4g} {unit}, up or down, and follows the voltage without these jumps:"
+        " the sensor, or its counter, begins again at the end of its range. Add the jumps up"
+        f" (numpy.unwrap with period={scale * period:.4g}), or record with a larger range."
+    )
 
 
 def doubtful_quantity(records: Sequence[Record]) -> str:
     """Say that a rate, an integral, or the sign turned below a voltage follows it better; else "".
 
-    A stack behind a lag that is long beside the voltage's changes looks so too. Nothing is said of
-    a record of which less than half is read: what it shows may follow the rate by itself.
+    A stack behind a lag that is long compared with the voltage's changes looks so too. "" for a
+    record of which less than half is read: that part may follow the rate by itself.
     """
     for record in records:
         y, v = _readings(record)
-        if 2 * y.size < record.n or abs(item := _correlation(y, v)) > _FOLLOWS:
+        if 2 * y.size < record.n or abs(plain := _correlation(y, v)) > _FOLLOWS:
             continue
         step = np.diff(record.time[record.mask])
         rate = _correlation(np.diff(y) / step, 0.5 * (v[1:] + v[:-1]))
@@ -236,15 +233,23 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
         both = np.column_stack([np.cumsum(0.5 * (y[1:] + y[:-1]) * step), v[1:]])
         summed, moved = (both - line @ np.linalg.lstsq(line, both, rcond=None)[0]).T
         integral = _correlation(summed, moved)
-        for result, is_it, holds in (
+        for other, what, holds in (
             (rate, "rate of", "an integral of"), (integral, "integral of", "the rate of"),
         ):  # fmt: skip
-            if abs(result) > _FOLLOWS:
-                return _OTHER.format(record.name, is_it, result, item, holds)
+            if abs(other) > _FOLLOWS:
+                return (
+                    f"Record '{record.name}': the {what} the displacement follows the voltage"
+                    f" (correlation {other:.3f}), the displacement itself does not ({plain:.3f}):"
+                    f" the column may hold {holds} it."
+                )
         turns = np.quantile(v, _TURNS)
-        result, at = max((abs(_correlation(np.where(v < u, -y, y), v)), u) for u in turns)
-        if result > _FOLLOWS:
-            return _TURNED.format(record.name, at, result, item)
+        turned, at = max((abs(_correlation(np.where(v < u, -y, y), v)), u) for u in turns)
+        if turned > _FOLLOWS:
+            return (
+                f"Record '{record.name}': with its sign turned below {at:.4g} V the displacement"
+                f" follows the voltage (correlation {turned:.3f}), as it is it does not"
+                f" ({plain:.3f}): it may be rectified."
+            )
     return ""
 
 
@@ -279,29 +284,16 @@ _LENGTHS = {-3: "um, not mm", -6: "um, not m", -9: "nm, not m",
 _VOLTAGES = {-3: "mV, not V", -6: "uV, not V", -9: "uV, not kV",
              3: "kV, not V", 6: "kV, not mV", 9: "kV, not uV"}  # fmt: skip
 
-_HIGH = (
-    "The voltage reaches {:.2g} V, and changes by {:.2g} V: no stack bears that. Its unit is"
-    " probably another, it has an offset, or the column holds something else"
-)
-_LOW = (
-    "The voltage changes by {:.2g} V only: that drives no stack. Its unit is probably another, or"
-    " the column holds something else"
-)
-_STRANGE = (
-    "The displacement changes by {:.2g} m, {} than a stack with any sensor: its unit is probably"
-    " another{}."
-)
-_CONSTANT = (
-    "The voltage is {:g} V throughout: a stack shows itself only where its voltage changes. Give a"
-    " record in which it does, or name its column (--columns voltage=...)."
-)
-
 
 def refuse_unusable(records: Sequence[Record]) -> None:
     """Raise InputError, with the likely cause, for records from which no fit can start."""
     span = max(float(np.ptp(r.voltage)) for r in records)
     if span == 0.0:
-        raise InputError([_CONSTANT.format(records[0].voltage[0])])
+        raise InputError(
+            f"The voltage is {records[0].voltage[0]:g} V throughout: a stack shows itself only"
+            " where its voltage changes. Give a record in which it does, or name its column"
+            " (--columns voltage=...)."
+        )
     refuse_stuck(records)
     top = max(float(np.max(np.abs(r.voltage))) for r in records)
     stroke = max(r.range_m for r in records)
@@ -310,12 +302,24 @@ def refuse_unusable(records: Sequence[Record]) -> None:
     texts = stray(records)
     if not low <= max(span, top) <= high or span < 1e-9 * top or span < low:
         other = _suggestion(stroke, span) if top < _OFFSET * span else ""
-        about = _HIGH.format(top, span) if top > high else _LOW.format(span)
-        raise InputError(texts or [f"{about}{other}."])
+        about = (
+            f"changes by {span:.2g} V only: that drives no stack. Its unit is probably another, or"
+            " the column holds something else"
+        )
+        if top > high:
+            about = (
+                f"reaches {top:.2g} V, and changes by {span:.2g} V: no stack bears that. Its unit"
+                " is probably another, it has an offset, or the column holds something else"
+            )
+        raise InputError(texts or [f"The voltage {about}{other}."])
     low, high = _USABLE_STROKES
     if not counts and not low <= stroke <= high:
         side = "more" if stroke > high else "less"
-        raise InputError(texts or [_STRANGE.format(stroke, side, _suggestion(stroke, span))])
+        strange = (
+            f"The displacement changes by {stroke:.2g} m, {side} than a stack with any sensor: its"
+            f" unit is probably another{_suggestion(stroke, span)}."
+        )
+        raise InputError(texts or [strange])
 
 
 def stray(records: Sequence[Record]) -> list[str]:

@@ -94,6 +94,12 @@ def mechanics_poles(theta: FloatArray) -> ComplexArray:
     return np.concatenate([[-1.0 / tau], pair(a_p, q_p), pair(a_b, q_b)])
 
 
+def oscillators(theta: FloatArray, k_P: float, k_B: float) -> dict[str, float]:
+    """Return c_P, m_P, c_B, m_B (SI) of theta for the stiffnesses [N/m]."""
+    a_p, q_p, a_b, q_b = np.exp(theta).tolist()[2:6]
+    return {"c_P": a_p * k_P, "m_P": q_p * k_P, "c_B": a_b * k_B, "m_B": q_b * k_B}
+
+
 def numerator_time(theta: FloatArray) -> float:
     """Return b [s], so that the zero of the response is -1/b, eq. (11)."""
     r = exp(theta[6])
@@ -119,7 +125,7 @@ def plays(u: FloatArray, radii: npt.ArrayLike) -> FloatArray:
     """Return play operators (n, k) of the radii on u (n,), all of them centred at the first sample.
 
     p_i = min(max(p_{i-1}, u_i - r), u_i + r). A run of such steps clips between two levels, so the
-    levels of all blocks are found side by side, then the blocks are joined.
+    levels of all blocks are computed side by side, then the blocks are joined.
     """
     r = np.asarray(radii, dtype=np.float64)
     length = max(int(sqrt(u.size)), 1)
@@ -187,14 +193,15 @@ _DECADES_BEYOND = 5.0
 class Response:
     """Samples h [s] apart: input w (n,), output y (n,), both 0 before, `valid` (n,), noise sigma.
 
-    Where `valid` is False, y holds a stand-in for the missing sample.
+    Where `valid` is False, y does not count, as of a sample that is missing. The modes of a
+    residual y need no sigma, and of the input w only its change from the first sample.
     """
 
     h: float
     w: FloatArray
     y: FloatArray
     valid: BoolArray
-    sigma: float
+    sigma: float = 1.0
 
 
 def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
@@ -209,7 +216,7 @@ def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
 
 
 def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatArray:
-    """Return the largest root mean square of every pole's own part of a response, over its noise.
+    """Return the largest root mean square of every pole's part of a response, over its noise.
 
     Shape (order,); the two poles of a pair share one figure.
     """
@@ -219,10 +226,10 @@ def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatAr
         matrix = np.column_stack([columns, np.ones(r.y.size)])[r.valid]
         q, transform = orthonormal(matrix)
         weights = transform @ (q.T @ r.y[r.valid])
-        for i, k in _places(poles):
-            width = 2 if poles[i].imag else 1
-            part = columns[:, k : k + width] @ weights[k : k + width]
-            values[i : i + width] = np.maximum(values[i : i + width], np.std(part) / r.sigma)
+        for k in np.flatnonzero(poles.imag >= 0):
+            pair = slice(k, k + (2 if poles[k].imag else 1))
+            part = columns[:, pair] @ weights[pair]
+            values[pair] = np.maximum(values[pair], np.std(part) / r.sigma)
     return values
 
 
@@ -238,8 +245,8 @@ def _relocated(responses: Sequence[Response], poles: ComplexArray) -> ComplexArr
     q, transform = orthonormal(np.vstack(rows))
     d = (transform @ (q.T @ np.concatenate(targets)))[-poles.size :]
     state, drive, sense = np.zeros((poles.size, poles.size)), np.zeros(poles.size), d.copy()
-    for i, k in _places(poles):
-        p, size = poles[i], abs(poles[i])
+    for k in np.flatnonzero(poles.imag >= 0):
+        p, size = poles[k], abs(poles[k])
         if p.imag:
             state[k : k + 2, k : k + 2] = [[p.real, p.imag], [-p.imag, p.real]]
             drive[k], sense[k : k + 2] = 2.0, size * d[k : k + 2] / 2.0 * np.array([1.0, -1.0])
@@ -260,11 +267,6 @@ def _settled(poles: ComplexArray, fastest: float, slowest: float) -> ComplexArra
         else:
             kept.append(complex(-size))
     return np.array(kept, dtype=np.complex128)
-
-
-def _places(poles: ComplexArray) -> list[tuple[int, int]]:
-    """Return (index of the pole, first of its real columns) for real poles and upper ones."""
-    return [(i, i) for i, p in enumerate(poles) if p.imag >= 0]
 
 
 def _columns(poles: ComplexArray, x: FloatArray, h: float) -> FloatArray:
@@ -297,18 +299,8 @@ class Mode:
     ahead: float
 
 
-@dataclass(frozen=True, eq=False)
-class Shaken:
-    """A record's drive and residual (n,) [m], the samples that count, the sample time [s]."""
-
-    drive: FloatArray
-    residual: FloatArray
-    used: BoolArray
-    sample_time: float
-
-
 def modes_of(
-    records: Sequence[Shaken], free: FloatArray, *, most: int, better: float
+    records: Sequence[Response], free: FloatArray, *, most: int, better: float
 ) -> list[Mode]:
     """Return modes while each brings the rms of the residual to a share `better` at most.
 
@@ -329,14 +321,14 @@ def modes_of(
         rest: FloatArray = what - q @ (q.T @ what)
         return rest
 
-    target = without_free(np.concatenate([r.residual[r.used] for r in records]))
+    target = without_free(np.concatenate([r.y[r.valid] for r in records]))
     size = float(np.linalg.norm(target))
 
     def of_all(flat: FloatArray) -> FloatArray:
         return left_of(target, flat.reshape(-1, 2)) / size
 
-    lowest = _PERIODS / max(r.sample_time * r.drive.size for r in records)
-    highest = _HIGHEST / min(r.sample_time for r in records)
+    lowest = _PERIODS / max(r.h * r.w.size for r in records)
+    highest = _HIGHEST / min(r.h for r in records)
     frequencies = np.log(np.geomspace(min(lowest, 0.1 * highest), highest, _FREQUENCIES))
     grid = [np.array([f, np.log(z)]) for f in frequencies for z in _DAMPINGS]
     edges = (
@@ -366,14 +358,13 @@ def modes_of(
     return [Mode(*np.exp(p), *g) for p, g in zip(poles, gains, strict=True)]
 
 
-def _ringing(records: Sequence[Shaken], frequency: float, damping: float) -> FloatArray:
+def _ringing(records: Sequence[Response], frequency: float, damping: float) -> FloatArray:
     """Return q and q'/w of a mode, q'' + 2 zeta w q' + w^2 q = w^2 drive, from rest (n, 2)."""
     omega = 2.0 * np.pi * frequency
     turn = np.sqrt(1.0 - damping**2)
     pole = omega * complex(-damping, turn)
     rows = []
     for r in records:
-        x = r.drive - r.drive[0]
-        both = [mode(pole, -0.5j * q / turn, x, r.sample_time) for q in (omega, pole)]
-        rows.append(np.column_stack(both)[r.used])
+        both = [mode(pole, -0.5j * q / turn, r.w - r.w[0], r.h) for q in (omega, pole)]
+        rows.append(np.column_stack(both)[r.valid])
     return np.vstack(rows)

@@ -1,6 +1,6 @@
 """Where a fit starts: a stack of the records' size, its capacitance, the form of its loop.
 
-The capacitance that a measured current or charge tells, without the mechanics.
+The capacitance from a measured current or charge, without the mechanics.
 
     C_p u' = i,   i = (G v - u) / R_s,   G = 1
 
@@ -25,7 +25,7 @@ from psa_casadi.components import BASE
 from psa_casadi.components.stack import BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.doubts import (
     doubtful_unit,
     refuse_unusable,
@@ -47,7 +47,7 @@ FORMS = {"bouc-wen": BOUC_WEN, "spectrum": MEMORY_SPECTRUM}
 
 
 def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
-    """Return the model in each form that is to be fitted; as it is where none is asked for.
+    """Return the model in each form that is to be fitted; as it is if `hysteresis` is None.
 
     Raises InputError for a model whose hysteresis has neither form.
     """
@@ -59,12 +59,12 @@ def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
             f"The model '{model.name}' has no hysteresis of its own to give another form; leave"
             " --hysteresis out."
         )
-    items = []
+    models = []
     for name in FORMS if hysteresis == "best" else (hysteresis,):
-        item = [FORMS[name] if c.name in known else c for c in model.components]
-        there = {c.name for c in item}
-        items.append(model.with_components(c for c in item if set(c.needs) <= there))
-    return tuple(items)
+        components = [FORMS[name] if c.name in known else c for c in model.components]
+        names = {c.name for c in components}
+        models.append(model.with_components(c for c in components if set(c.needs) <= names))
+    return tuple(models)
 
 
 #: Times T that are tried, over the sampling interval, and how often the grid closes in.
@@ -101,7 +101,7 @@ class Capacitance:
         return abs(value - self.value) < _SAME * self.value
 
     def sentence(self, value: float) -> str:
-        """What the current says, in words; `value` [F] is that of the model."""
+        """The capacitance in words; `value` [F] is that of the model."""
         result = note(
             "capacitance", source=self.source, value=1e6 * self.value, low=1e6 * self.interval.low,
             high=1e6 * self.interval.high, share=100 * self.explained,
@@ -111,33 +111,34 @@ class Capacitance:
 
 
 def capacitance_of(records: Sequence[Record]) -> Capacitance | None:
-    """Return what measured currents tell, else charges; None where neither follows a capacitance.
+    """Return the capacitance from measured currents, else charges; None if neither follows one.
 
     A current that is limited, leaks, has its sign turned, or belongs to another voltage is
-    explained badly. Records with uneven time steps tell nothing.
+    explained badly. Records with uneven time steps are left out.
     """
-    item = [
+    even = [
         r
         for r in records
         if r.current is not None
         and r.n > 3
         and np.ptp(np.diff(r.time)) < _UNEVEN * np.mean(np.diff(r.time))
     ]
-    items = [np.asarray(r.current, dtype=np.float64) for r in item]
-    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in items)
-    if total == 0.0:
-        return _by_charge(records)
-    times = min(r.sample_time for r in item) * _TIMES
+    currents = [np.asarray(r.current, dtype=np.float64) for r in even]
+    total = sum(float(np.sum((i - np.mean(i)) ** 2)) for i in currents)
+    c = _by_current(even, total) if total else _by_charge(records)
+    followed = c and c.explained >= _EXPLAINED and _ORDINARY[0] < c.value < _ORDINARY[1]
+    return c if followed else None
+
+
+def _by_current(records: Sequence[Record], total: float) -> Capacitance:
+    """Return the capacitance at the best time T; `total` is the sum of squares of the currents."""
+    times = min(r.sample_time for r in records) * _TIMES
     for _ in range(_ROUNDS):
-        left = [_solved(item, float(q))[1] for q in times]
-        k = int(np.argmin(left))
+        k = int(np.argmin([_solved(records, float(q))[1] for q in times]))
         best = float(times[k])
         times = np.geomspace(times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)], len(_TIMES))
-    value, rest, error = _solved(item, best)
-    explained = 1.0 - rest / total
-    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
-        return None
-    return Capacitance(value, error, explained)
+    value, rest, error = _solved(records, best)
+    return Capacitance(value, error, 1.0 - rest / total)
 
 
 def _by_charge(records: Sequence[Record]) -> Capacitance | None:
@@ -150,11 +151,8 @@ def _by_charge(records: Sequence[Record]) -> Capacitance | None:
         return None
     value = sum(float(v @ q) for v, q in pairs) / power
     rest = sum(float(np.sum((q - value * v) ** 2)) for v, q in pairs)
-    explained = 1.0 - rest / total
-    if explained < _EXPLAINED or not _ORDINARY[0] < value < _ORDINARY[1]:
-        return None
     # what is left is a loop, not noise: its width does not average out
-    return Capacitance(value, float(np.sqrt(rest / power)), explained, "charge")
+    return Capacitance(value, float(np.sqrt(rest / power)), 1.0 - rest / total, "charge")
 
 
 def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float]:
@@ -166,28 +164,28 @@ def _solved(records: Sequence[Record], time: float) -> tuple[float, float, float
     for k, record in enumerate(records):
         keep = float(np.exp(-record.sample_time / time))
         rate = np.append(0.0, np.diff(record.voltage) / np.diff(record.time))
-        item = np.zeros((record.n, 1 + 2 * len(records)))
-        item[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
-        item[:, 1 + 2 * k] = 1.0
-        item[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
-        every.append(item)
+        block = np.zeros((record.n, 1 + 2 * len(records)))
+        block[:, 0] = filtered([1.0 - keep], [1.0, -keep], rate)
+        block[:, 1 + 2 * k] = 1.0
+        block[:, 2 + 2 * k] = np.exp(-(record.time - record.time[0]) / time)
+        every.append(block)
     columns = np.vstack(every)
     scale = np.linalg.norm(columns, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)
     columns /= scale
-    displayed = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
-    result, *_ = np.linalg.lstsq(columns, displayed, rcond=None)
-    rest = displayed - columns @ result
+    current = np.concatenate([np.asarray(r.current, dtype=np.float64) for r in records])
+    weights, *_ = np.linalg.lstsq(columns, current, rcond=None)
+    rest = current - columns @ weights
     power = float(rest @ rest)
     similar = min(max(float(rest[1:] @ rest[:-1]) / max(power, 1e-300), 0.0), 0.999)
     inflation = (1.0 + similar) / (1.0 - similar)
     spread = np.linalg.pinv(columns.T @ columns, hermitian=True)[0, 0]
     freedom = max(len(rest) - columns.shape[1], 1)
     error = float(np.sqrt(spread * power / freedom * inflation)) / scale[0]
-    return float(result[0] / scale[0]), power, error
+    return float(weights[0] / scale[0]), power, error
 
 
-#: Stiffness assumed where none is given [N/m]: displacement then is right, forces are not.
+#: Stiffness assumed without a data sheet's [N/m]: displacement then is right, forces are not.
 ASSUMED_STIFFNESS = 5e7
 #: Stiffness of the wafers over that of the bonding layers, assumed.
 _WAFER_RATIO = 5.0
@@ -210,7 +208,7 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
     """Return the base model scaled to the records' voltage span, stroke and sampling.
 
     In the one-way cascade a load meets the bonding layers only, so the stiffness [N/m] that a data
-    sheet measures is k_B; it is `ASSUMED_STIFFNESS` where none is given, since voltage and
+    sheet measures is k_B; it is `ASSUMED_STIFFNESS` if that is None, since voltage and
     displacement do not determine forces. k_P = 5 k_B is assumed; k_L (1/k_P + 1/k_B) is the
     regression slope of displacement on voltage (paper, eq. 14). C_p is that of the measured current
     (`capacitance_of`), else assumed. Raises InputError where that is
@@ -237,15 +235,15 @@ def starting_model(records: Sequence[Record], stiffness: float | None = None) ->
         "n": LOOP_SHAPES[0]["n"],
     }
     try:
-        return compose(BASE, {**values, **_within(_lags(values, sample_time))})
+        return compose(BASE, {**values, **within_base(_lags(values, sample_time))})
     except InputError as error:
         raise InputError(stray(records) or [doubt]) if doubt else error from None
 
 
-def _within(lags: Mapping[str, float]) -> dict[str, float]:
-    """Return lags within the bounds of their parameters, however slow or fast the sampling is."""
+def within_base(values: Mapping[str, float]) -> dict[str, float]:
+    """Return values of some parameters of the base model, clipped to their bounds."""
     bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    return {name: float(np.clip(value, *bounds[name])) for name, value in lags.items()}
+    return {name: float(np.clip(value, *bounds[name])) for name, value in values.items()}
 
 
 def chosen_start(
@@ -253,8 +251,8 @@ def chosen_start(
 ) -> tuple[Model, bool]:
     """Return where a fit starts, and whether its force scale is known.
 
-    A `model` is taken as it is, but for start values of its own, which belong to its parameters; a
-    `stiffness` [N/m] beside it changes its force scale: all forces, stiffnesses, dampings and
+    A `model` is taken as it is, but for declared start values, which belong to its parameters; a
+    `stiffness` [N/m] with it changes its force scale: all forces, stiffnesses, dampings and
     masses are multiplied by one factor, which displacements do not show.
     """
     if model is None:
@@ -262,9 +260,9 @@ def chosen_start(
     model = model.with_declared_starts()
     if stiffness is None:
         return model, model.provenance.force_scale == "given"
-    item = next(model.values[name] for name in ("k_B", "k") if name in model.values)
+    before = next(model.values[name] for name in ("k_B", "k") if name in model.values)
     forces = [p for p in model.structure.parameters if p.unit == "kg" or p.unit[:1] == "N"]
-    scaled = {p.name: model.values[p.name] * stiffness / item for p in forces}
+    scaled = {p.name: model.values[p.name] * stiffness / before for p in forces}
     return model.with_values(scaled), True
 
 
@@ -286,7 +284,7 @@ def ordinary_values(
 ) -> dict[str, float]:
     """Return an ordinary loop, some 12 % wide, and lags below the sampling, to the records' size.
 
-    A search that begins with a loop that saturates late may end beside one that does so `soon`.
+    A search that starts from a loop that saturates late may end near one that does so `soon`.
     k_L comes from the regression of displacement on voltage: that of a fitted model may be far off
     it, since a steep loop trades k_L for A.
     """
@@ -303,7 +301,7 @@ def has_loop(model: Model) -> bool:
 
 
 def _lags(values: Mapping[str, float], sample_time: float) -> dict[str, float]:
-    """Return lags somewhat below the sampling interval; what is much faster cannot be told."""
+    """Return lags somewhat below the sampling interval; much faster ones are not determined."""
     lags = {
         "tau": float(np.clip(0.7 * sample_time, 1e-6, 0.5)),
         "R_s": 0.3 * sample_time / values["C_p"],
@@ -341,7 +339,7 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     """Return k_L, A, beta, gamma [N/V], delta [N/(V.s)] and n of the slowest loops, or None.
 
     Forces follow from the model's stiffnesses by eq. (14), beta and gamma belong to its h_ref.
-    None where no record's voltage turns, or nothing moves. Only where a search begins depends on
+    None where no record's voltage turns, or nothing moves. Only the start of a search depends on
     these values, so they may come from all samples, held-out ones too.
     """
     loops = [_loop(r) for r in _slowest(records)]
@@ -363,16 +361,16 @@ def loop_start(model: Model, records: Sequence[Record]) -> dict[str, float] | No
     low = np.array([_K[0], _N[0], *[-_DOUBT] * len(loops)])
     high = np.array([_K[1], _N[1], *[_DOUBT] * len(loops)])
     none = [0.0] * len(loops)
-    items = [
+    fits = [
         scipy.optimize.least_squares(weighted, [*start, *none], bounds=(low, high), max_nfev=30)
         for start in _STARTS
     ]
-    best = min(items, key=lambda f: float(f.cost)).x
+    best = min(fits, key=lambda f: float(f.cost)).x
     s, beta, gamma, delta = parts(best)[0]
     k = best[0] * slope
     values = {"k_L": k, "A": s - k, "beta": beta, "gamma": gamma, "delta": delta}
     forces = {n: float(v) / compliance for n, v in values.items()} | {"n": float(best[1])}
-    return {n: float(np.clip(v, *model.parameter(n).bounds)) for n, v in forces.items()}
+    return within_bounds(model, forces)
 
 
 def _eliminated(
@@ -413,7 +411,7 @@ def _rate(record: Record) -> float:
 
 
 def _loop(record: Record) -> _Loop:
-    """Return a record, averaged in blocks where it has many samples; at rest if it begins so."""
+    """Return a record, averaged in blocks if it has many samples; `rests` if it starts at 0 V."""
     valid = record.mask
     y = np.interp(record.time, record.time[valid], measured(record)[valid])
     every = -(-record.n // _SAMPLES)

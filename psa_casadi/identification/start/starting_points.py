@@ -25,9 +25,8 @@ from math import log
 
 import numpy as np
 
-from psa_casadi.components import BASE
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
-from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.linear_response import (
     Response,
     contributions,
@@ -35,11 +34,17 @@ from psa_casadi.identification.start.linear_response import (
     mechanics_poles,
     numerator_time,
     orthonormal,
+    oscillators,
     plays,
     respond,
     vector_fit,
 )
-from psa_casadi.identification.start.ordinary import has_loop, loop_start, loop_starts
+from psa_casadi.identification.start.ordinary import (
+    has_loop,
+    loop_start,
+    loop_starts,
+    within_base,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.noise import high_frequency_noise
@@ -51,7 +56,7 @@ SAMPLES, MOST = 8_000, 4_000
 #: Radii of the play operators that stand for the loop, over the range of the voltage.
 RADII = tuple(k / 16.0 for k in range(1, 9))
 #: Share of its range that a static loop must miss in a record: with a voltage that crosses its
-#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be missed.
+#: range within `_FAST` samples, and with a slower one, where the shape of the loop may be wrong.
 _SHOWS_FAST, _SHOWS_SLOW, _FAST = 0.01, 0.03, 16.0
 #: A record whose voltage takes this many times longer than that of the fastest adds no dynamics.
 _SLOWER = 30.0
@@ -60,11 +65,11 @@ _NOISE = (2e-3, 2e-2)
 _FEWEST = 16
 #: Share of the range within which a response has settled, and within which it is all but over.
 _SETTLED, _OVER = 0.01, 0.05
-#: Share of an excerpt that begins in motion and is given to its transient.
+#: Share of an excerpt that starts in motion which is left out as its transient.
 _LEAD = 0.2
-#: A motion that begins with less than this share of its ordinary rate begins at rest.
+#: A motion that starts with less than this share of its ordinary rate starts at rest.
 _SLOWLY = 0.2
-#: Voltages alike within this share of the range are one level.
+#: Voltages equal within this share of the range are one level.
 _LEVEL = 1e-4
 
 
@@ -94,8 +99,8 @@ class Excerpt:
         return float(np.ptp(self.y[self.valid]))
 
     @property
-    def missed(self) -> float:
-        """Root mean square that a static loop leaves beyond the noise [m]."""
+    def excess(self) -> float:
+        """Root mean square that a static loop leaves above the noise [m]."""
         return float(np.sqrt(max(self.static**2 - self.sigma**2, 0.0)))
 
     @property
@@ -120,16 +125,14 @@ class _Samples:
 
 def excerpts(records: Sequence[Record]) -> list[Excerpt]:
     """Return the excerpts in which a static loop misses what is there, the clearest first."""
-    result = [e for r in records for e in _of_record(r)]
-    items = [
+    dynamic = [
         e
-        for e in result
-        if (e.static > _SHOWS_FAST * e.range if _fast(e) else e.missed > _SHOWS_SLOW * e.range)
+        for e in (e for r in records for e in _of_record(r))
+        if (e.static > _SHOWS_FAST * e.range if _fast(e) else e.excess > _SHOWS_SLOW * e.range)
     ]
-    items.sort(key=lambda e: e.range / e.static)
-    fastest = min((e.crossing for e in items), default=0.0)
+    fastest = min((e.crossing for e in dynamic), default=0.0)
     kept: list[Excerpt] = []
-    for e in items:
+    for e in sorted(dynamic, key=lambda e: e.range / e.static):
         room = not kept or sum(k.y.size for k in kept) + e.y.size <= SAMPLES
         if room and e.crossing <= _SLOWER * fastest:
             kept.append(e)
@@ -238,7 +241,7 @@ def _settled(y: FloatArray, tolerance: float) -> int:
 def _leading_rest(v: FloatArray) -> int:
     """Return how many samples at the start have the first voltage; 0 if it was moving before.
 
-    A single sample counts as a rest where the voltage jumps to a level or begins to move slowly.
+    A single sample counts as a rest where the voltage jumps to a level or starts to move slowly.
     """
     level = _LEVEL * float(np.ptp(v))
     changed = np.flatnonzero(np.abs(v - v[0]) > level)
@@ -259,14 +262,13 @@ def fastest_part(v: FloatArray, length: int) -> int:
     return max(best - length // 50, 0)
 
 
-#: Names of the coordinates: natural logarithms of times T, tau, a, of squares of times q, and of
-#: r = k_P/k_B, as in `linear_response`.
-COORDINATES = ("T", "tau", "a_P", "q_P", "a_B", "q_B", "r")
+#: Coordinates theta are the natural logarithms of the times T, tau, a_P, of q_P, a square of a
+#: time, of a_B, q_B, and of r = k_P/k_B, as in `linear_response`.
 #: Standard deviations of the weak priors of the coordinates, centred where a fit starts.
 _PRIOR = np.array([2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0])
 #: Weak priors, all with standard deviation 1.5: ln of the damping ratios a/(2 sqrt(q)) about 0.7,
 #: which keeps a pole and the zero from cancelling far below the band, and ln (m_P/m_B) about 0,
-#: since wafers and bonding layers with their places exchanged respond alike.
+#: since wafers and bonding layers with their places exchanged respond almost equally.
 _TYPICAL = np.array(
     [[0, 0, 1, -0.5, 0, 0, 0], [0, 0, 0, 0, 1, -0.5, 0], [0, 0, 0, 1, 0, -1, 1]]
 ) / 1.5  # fmt: skip
@@ -276,7 +278,7 @@ _TYPICAL_AT = np.log([1.4, 1.4, 1.0]) / 1.5
 #: way from standing for a fast response behind a slow drive.
 _LOOP_PRIOR, _CURVE_PRIOR = (0.03, 0.1), (0.03, 0.02)
 #: The same for a shift of the voltage in time, in samples, where it jumps within `_JUMP` samples:
-#: the record does not tell when, between two of them.
+#: the instant between two samples is not known.
 _SHIFT_PRIOR, _JUMP = (0.0, 0.3), 2.0
 #: Step of the derivatives by differences, in natural logarithms.
 _STEP = 1e-3
@@ -326,23 +328,17 @@ def fit_linear(
         raise ArithmeticError("The linear fit has no value at its start.")
     theta = start.copy()
     theta[free] = minimum.theta
-    data, first = [], 0
-    for e in parts:
-        count = int(e.valid.sum())
-        data.append(minimum.residual[first : first + count])
-        first += count + _weights_of(e)
+    ends = np.cumsum([int(e.valid.sum()) + _weights_of(e) for e in parts])
+    blocks = np.split(minimum.residual, ends)
+    data = [b[: int(e.valid.sum())] for e, b in zip(parts, blocks, strict=False)]
     level = max(1.0, float(np.mean(np.concatenate(data) ** 2)))
     information = minimum.jacobian.T @ minimum.jacobian / level
     errors = np.full(7, np.nan)
     errors[free] = np.sqrt(np.diag(np.linalg.pinv(information, hermitian=True)))
     residuals = [e.sigma * r for e, r in zip(parts, data, strict=True)]
-    return LinearFit(
-        theta=theta,
-        errors=errors,
-        cost=minimum.cost,
-        left=tuple(float(np.sqrt(np.mean(r**2))) for r in residuals),
-        white=tuple(high_frequency_noise(r) for r in residuals),
-    )
+    left = tuple(float(np.sqrt(np.mean(r**2))) for r in residuals)
+    white = tuple(high_frequency_noise(r) for r in residuals)
+    return LinearFit(theta, errors, minimum.cost, left, white)
 
 
 def _cost_of(parts: Sequence[Excerpt], theta: FloatArray) -> float:
@@ -353,11 +349,10 @@ def _cost_of(parts: Sequence[Excerpt], theta: FloatArray) -> float:
 
 
 def _bounds(parts: Sequence[Excerpt]) -> tuple[FloatArray, FloatArray]:
-    shortest = np.log(_SHORTEST * min(e.h for e in parts))
-    longest = np.log(min(e.longest for e in parts))
-    power = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0])
-    ratio = np.log([0.05, 100.0])
-    return np.append(power * shortest, ratio[0]), np.append(power * longest, ratio[1])
+    times = np.log([_SHORTEST * min(e.h for e in parts), min(e.longest for e in parts)])
+    power, ratio = np.array([1.0, 1.0, 1.0, 2.0, 1.0, 2.0]), np.log([0.05, 100.0])
+    low, high = (np.append(power * t, r) for t, r in zip(times, ratio, strict=True))
+    return low, high
 
 
 def _weights_of(e: Excerpt) -> int:
@@ -430,34 +425,28 @@ _MISSED = 10.0
 
 @dataclass(frozen=True)
 class LinearCandidate:
-    """Starting values by parameter name, how far they miss, and what is told.
+    """Starting values by parameter name, their misfit, and the parameters that are determined.
 
-    `misfit` is the root mean square of what the fast records leave over, as a share of their
-    range; `told` names the parameters that they determine within a factor of e^(1/2).
+    `misfit` is the rms residual of the fast records as a share of their range; `determined` names
+    the parameters with a standard error below a factor of e^(1/2).
     """
 
     values: Mapping[str, float]
     misfit: float
-    told: tuple[str, ...]
+    determined: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class LinearStart:
-    """Candidates, the best first, and the records they come from."""
-
-    candidates: tuple[LinearCandidate, ...]
-    records: tuple[str, ...]
-
-
-def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> LinearStart | None:
-    """Return starting values of tau, R_s, c_P, m_P, c_B, m_B, and of k_P where its share is told.
+def linear_start(
+    records: Sequence[Record], values: Mapping[str, float]
+) -> tuple[LinearCandidate, ...]:
+    """Return starting values of tau, R_s, c_P, m_P, c_B, m_B, and k_P if determined; best first.
 
     `values` gives C_p [F], k_P and k_B [N/m], which voltage and displacement do not determine.
-    None where the records show no dynamics: loops that a static loop explains.
+    Empty if the records show no dynamics: loops that a static loop explains.
     """
     parts: Sequence[Excerpt] = excerpts(records)
     if not parts:
-        return None
+        return ()
     starts: list[FloatArray] = []
     for e in parts[:_SOURCES]:
         v, y = e.v[e.valid] - np.mean(e.v[e.valid]), e.y[e.valid]
@@ -466,13 +455,7 @@ def linear_start(records: Sequence[Record], values: Mapping[str, float]) -> Line
             starts += placed(e, source, ORDERS, [log(values["k_P"] / values["k_B"])], weak=True)
     best, parts = sought(parts, starts, _ROUNDS, ratio_free=False, reweigh=True)
     fits = _different(_refined(parts, f) for f in best[:CANDIDATES])
-    kept = [f for f in fits if _explains(parts, f)]
-    if not kept:
-        return None
-    return LinearStart(
-        candidates=tuple(_candidate(f, values, _share(parts, f.left)) for f in kept),
-        records=tuple(e.name for e in parts),
-    )
+    return tuple(_candidate(f, values, _share(parts, f.left)) for f in fits if _explains(parts, f))
 
 
 def sought(
@@ -531,9 +514,8 @@ def _refined(parts: Sequence[Excerpt], fit: LinearFit) -> LinearFit:
     fixed = fit_linear(parts, fit.theta, ratio_free=False, evaluations=_FULL)
     free = fit_linear(parts, fixed.theta, ratio_free=True, evaluations=_FULL)
     samples = sum(int(e.valid.sum()) for e in parts)
-    level = max(1.0, free.cost / samples)
-    output = free.errors[-1] < 0.5 and fixed.cost - free.cost > level * log(samples)
-    return free if output else fixed
+    needed = max(1.0, free.cost / samples) * log(samples)
+    return free if free.errors[-1] < 0.5 and fixed.cost - free.cost > needed else fixed
 
 
 def _different(fits: Iterable[LinearFit]) -> list[LinearFit]:
@@ -546,24 +528,15 @@ def _different(fits: Iterable[LinearFit]) -> list[LinearFit]:
 
 
 def _candidate(fit: LinearFit, values: Mapping[str, float], misfit: float) -> LinearCandidate:
-    size = dict(zip(COORDINATES, np.exp(fit.theta).tolist(), strict=True))
+    drive, tau, *_, ratio = np.exp(fit.theta).tolist()
     ratio_free, k_B = not np.isnan(fit.errors[-1]), values["k_B"]
-    k_P = size["r"] * k_B if ratio_free else values["k_P"]
-    table = {
-        "R_s": size["T"] / values["C_p"],
-        "tau": size["tau"],
-        "c_P": size["a_P"] * k_P,
-        "m_P": size["q_P"] * k_P,
-        "c_B": size["a_B"] * k_B,
-        "m_B": size["q_B"] * k_B,
-        "k_P": k_P,
-    }
-    output = tuple(n for n, e in zip(table, fit.errors, strict=True) if e < 0.5)
-    if not ratio_free:
-        del table["k_P"]
-    bounds = {p.name: p.bounds for c in BASE for p in c.parameters}
-    within = {n: float(np.clip(v, *bounds[n])) for n, v in table.items()}
-    return LinearCandidate(within, misfit, output)
+    k_P = ratio * k_B if ratio_free else values["k_P"]
+    table = {"R_s": drive / values["C_p"], "tau": tau, **oscillators(fit.theta, k_P, k_B)}
+    names = (*table, "k_P")
+    determined = tuple(n for n, e in zip(names, fit.errors, strict=True) if e < 0.5)
+    return LinearCandidate(
+        within_base(table | ({"k_P": k_P} if ratio_free else {})), misfit, determined
+    )
 
 
 def placed(
@@ -571,7 +544,7 @@ def placed(
 ) -> Iterator[FloatArray]:
     """Yield theta (7,) for every way to place the poles of an excerpt's response to a source (n,).
 
-    Poles that hardly show are left out; with `weak` also those that do beside the strongest.
+    Poles that hardly show are left out; with `weak` also those that hardly do over the strongest.
     """
     response = [Response(e.h, source, e.y, e.valid, e.sigma)]
     for order in orders:
@@ -589,7 +562,7 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
 
     Oscillations belong to wafers and bonding layers, the slowest real pole to the creep lag or
     the drive, others to the drive or an overdamped pair. What is left open lies at 0.3 of the
-    shortest time found, not below a quarter of the sampling interval.
+    shortest of these times, not below a quarter of the sampling interval.
     """
     times = sorted((1.0 / abs(p) for p in poles if not p.imag), reverse=True)
     tones = sorted((p for p in poles if p.imag > 0), key=abs)
@@ -623,22 +596,19 @@ def starting_points(
     """Return the starts by name; static gain and loop keep their size where k_P moves.
 
     The loop that the records show comes first, then shapes that loops usually have: fewer of them
-    where the records show a loop, and where they show dynamics to try. The model's own loop where
+    where the records show a loop, and where they show dynamics to try. The model's loop where
     its hysteresis is none of Bouc-Wen's.
     """
     shapes: list[tuple[str, dict[str, float]]] = [("the model's own loop", {})]
     if has_loop(model):
         shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
-        displayed = loop_start(model, records)
-        if displayed is not None:
-            shapes = [("the records' loops", displayed), *shapes[: 1 if linear else 2]]
+        loop = loop_start(model, records)
+        if loop is not None:
+            shapes = [("the records' loops", loop), *shapes[: 1 if linear else 2]]
     if not linear:
         return shapes
-    bounds = {p.name: p.bounds for p in model.structure.parameters}
-    dynamics = [
-        {n: float(np.clip(v, *bounds[n])) for n, v in values.items()}
-        for values in _dynamics(model, linear, min(r.sample_time for r in records))
-    ]
+    sample_time = min(r.sample_time for r in records)
+    dynamics = [within_bounds(model, values) for values in _dynamics(model, linear, sample_time)]
     named = [(name, _moved(model, shape, dynamics[0])) for name, shape in shapes]
     return named + [
         (f"dynamics {k}", _moved(model, shapes[0][1], other))
@@ -651,15 +621,15 @@ def resolved(
 ) -> tuple[str, ...]:
     """Return the masses, and k_P, that are searched because the best candidate shows them.
 
-    Two masses that the sampling resolves are searched even where they are told badly: lags told
-    beside masses that are only assumed would look surer than they are.
+    Two masses that the sampling resolves are searched even if they are determined badly: with
+    assumed masses the intervals of the lags would be too short.
     """
     if not linear:
         return ()
     values = {**model.values, **linear[0].values}
     times = {m: (values[m] / values[m.replace("m", "k")]) ** 0.5 for m in _MASSES}
     masses = tuple(m for m, t in times.items() if t >= _RESOLVED * sample_time)
-    return (*masses, *(n for n in ("k_P",) if masses and n in linear[0].told))
+    return (*masses, *(n for n in ("k_P",) if masses and n in linear[0].determined))
 
 
 def _dynamics(
@@ -667,7 +637,7 @@ def _dynamics(
 ) -> list[dict[str, float]]:
     """Return the dynamics to start from: the creep lag the slower one, then the drive's lag.
 
-    A linear response cannot tell the two apart; amplifiers are usually the faster. Where the
+    A linear response does not separate the two; amplifiers are usually the faster. Where the
     sampling resolves no mass, masses stay as they are and the slowest lag is the creep lag.
     """
     near = [dict(c.values) for c in linear if c.misfit < _WORSE * linear[0].misfit]

@@ -1,6 +1,6 @@
-"""Voltage and displacement that were sampled by two clocks: found from a record alone, undone.
+"""Voltage and displacement sampled by two clocks: detected from a record alone, and undone.
 
-Two devices that sample with clocks of their own, one of which renews its value every P seconds,
+Two devices that sample with different clocks, one of which renews its value every P seconds,
 differ by a delay that grows or falls evenly by P while the clocks pass each other, and jumps back:
 
     y(t) = x(t - d(t)),    d(t) = P (saw(t) - 1/2),    y = x - d x' to first order.
@@ -11,7 +11,7 @@ the delay. Only the saw tooth is undone, about its mean: a delay that is constan
 the stack's or the sensor's, and stays. Source: the beat of two free-running quartz clocks, which
 differ by 10 to 100 parts in a million.
 
-A saw tooth in delays over time: the beat of two clocks, told from everything that is smooth.
+A saw tooth in delays over time: the beat of two clocks, separated from all that is smooth.
 
     d(t) = c_0 + c_1 t + height ((phase + beats t / T) mod 1)
 
@@ -161,11 +161,11 @@ _INTERVALS, _EACH, _LONGEST = 256, 4, 50_000
 _PLAYS, _POWERS, _RELAXATIONS = 13, 3, 12
 #: Reversals that a beat must hold, else it may be a form of the loops.
 _REVERSALS = 8
-#: An interval counts at most so many times as much as the median one.
+#: Largest weight of an interval over the median one.
 _HEAVIEST = 4.0
-#: Times that fit and saw tooth are found beside each other.
+#: Rounds of fit and saw tooth in turn.
 _ROUNDS = 4
-#: Largest relative difference of time steps of one clock, beside its rounding.
+#: Largest relative difference of time steps of one clock, with its rounding.
 _EVEN = 1e-2
 
 
@@ -173,7 +173,7 @@ _EVEN = 1e-2
 class TwoClocks:
     """What two clocks did to a record: `period` [s] and `height` [s] of the delay's saw tooth.
 
-    `falling` says that the delay falls evenly and jumps up; `moved` (n,) [m] is what each reading
+    `falling`: the delay falls evenly and jumps up; `moved` (n,) [m] is what each reading
     was off by about the mean delay, nan where there is none.
     """
 
@@ -185,7 +185,7 @@ class TwoClocks:
     def undone(self, record: Record) -> Record:
         """Return the record with its readings where one clock would have taken them.
 
-        It is another record: it has no `source`, and a `sha256` of its own.
+        It is another record: it has no `source`, and another `sha256`.
         """
         if record.displacement is None:
             return record
@@ -193,11 +193,11 @@ class TwoClocks:
         return replace(record, displacement=there, sha256="", source="")
 
     def sentence(self, record: Record) -> str:
-        """Say what was found in the record."""
+        """Return the beat of the record in words."""
         return str(self.note(record))
 
     def note(self, record: Record, code: str = "two_clocks") -> Note:
-        """Return what was found in the record."""
+        """Return the beat of the record as a note."""
         scale, unit = (1e9, "nm") if record.displacement_unit == "m" else (1.0, "counts")
         off = scale * float(np.sqrt(np.nanmean(self.moved**2)))
         way = "falls" if self.falling else "grows"
@@ -222,9 +222,9 @@ def on_one_clock(record: Record) -> tuple[Record, tuple[Note, ...]]:
 def two_clocks(record: Record) -> TwoClocks | None:
     """Return the saw tooth in the delay between the columns, None where none is beyond doubt.
 
-        found = psa.two_clocks(record)
-        if found is not None:
-            record = found.undone(record)
+        clocks = psa.two_clocks(record)
+        if clocks is not None:
+            record = clocks.undone(record)
 
     It must show in both halves of the record and at two jumps at least, and must be no higher than
     one sampling interval. Records with uneven time steps, or with a beat that holds fewer than

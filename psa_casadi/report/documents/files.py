@@ -535,7 +535,7 @@ def posterior_file(posterior: Posterior) -> dict[str, Any]:
     for b in task.density.blocks:
         e, channel = task.experiments[b.record], task.channel(b)
         samples = int(e.at(b.channel).sum())
-        row = e.record.name, e.record.sha256, samples, b.alike, b.level
+        row = e.record.name, e.record.sha256, samples, b.correlation_time, b.level
         records.append(SampledRecord(*row, channel.column, channel.unit))
     parameters = {
         f.name: SampledParameter(

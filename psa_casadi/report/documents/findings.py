@@ -18,8 +18,8 @@ from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
 from psa_casadi.population.finding import (
     BudgetShare,
+    Estimate,
     Finding,
-    Found,
     HeldOutErrors,
     NamedCause,
     replayed,
@@ -126,8 +126,7 @@ def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
     if isinstance(d, files.DiagnosisFile):
         base, extended = d.base_errors, d.extended_errors
         rms = base.holdout_rms_m, extended.holdout_rms_m, d.noise_floor_rms_m
-        percents = base.holdout_nrmse_percent, extended.holdout_nrmse_percent
-        errors = [HeldOutErrors(*rms, *percents)]
+        errors = [HeldOutErrors(*rms, extended.holdout_nrmse_percent)]
     elif isinstance(d, files.OwnModelFile):
         errors = [
             HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
@@ -137,7 +136,9 @@ def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
         device="",
         kind="diagnosis",
         parameters={
-            n: Found(p.value, p.unit, p.interval) for c in d.causes for n, p in c.parameters.items()
+            n: Estimate(p.value, p.unit, p.interval)
+            for c in d.causes
+            for n, p in c.parameters.items()
         },
         records=tuple((r.name, r.sha256) for r in d.records),
         verdict=d.verdict,
@@ -157,7 +158,9 @@ def _identification(i: files.IdentificationFile) -> Finding:
         device="",
         kind="identification",
         parameters={
-            n: Found(p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning)
+            n: Estimate(
+                p.value, p.unit, p.interval, p.determined in ("determined", "weak"), p.meaning
+            )
             for n, p in i.parameters.items()
         },
         records=tuple(dict.fromkeys((r.name, r.sha256) for r in i.records)),
@@ -165,7 +168,7 @@ def _identification(i: files.IdentificationFile) -> Finding:
         rms_percent=max((r.rms_percent_of_range for r in i.records), default=None),
         notes=(*i.warnings, *i.notes),
         warnings=i.warnings,
-        missed=i.missed,
+        noise_ratio=i.missed,
     )
 
 
@@ -174,7 +177,7 @@ def _model(model: Model, traces: bool) -> Finding:
     for p in model.structure.parameters:
         interval = (i.low, i.high) if (i := origin.intervals.get(p.name)) else None
         fields = model.values[p.name], p.unit, interval, p.name in origin.free, p.description
-        parameters[p.name] = Found(*fields)
+        parameters[p.name] = Estimate(*fields)
     with suppress(PsaError):  # without the model's curve the page has all the rest
         trace = replayed(model) if traces else None
     return Finding(
@@ -251,9 +254,9 @@ def finding_content(finding: Finding) -> dict[str, Any]:
         for name in ("base", "extended", "noise"):
             row[f"{prefix}{name}_rms [{unit}]"] = getattr(e, name, None)
     row["rms [m]"], row["rms [% of range]"] = finding.rms_m, finding.rms_percent
-    row["missed [times the noise]"] = finding.missed
+    row["missed [times the noise]"] = finding.noise_ratio
     for name, p in finding.parameters.items():
-        if p.told and p.interval is not None:
+        if p.determined and p.interval is not None:
             row[f"{name} [{p.unit}]"] = p.value
             row[f"{name} low"], row[f"{name} high"] = p.interval
     return row

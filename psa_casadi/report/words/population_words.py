@@ -105,7 +105,7 @@ def population_sentences(p: population.Population) -> tuple[str, ...]:
 
 def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
     """Return which devices' fits miss their records, a sentence; none where no fit does."""
-    rows = sorted((-f.missed, f.device) for f in findings if f.missed is not None)
+    rows = sorted((-f.noise_ratio, f.device) for f in findings if f.noise_ratio is not None)
     if not rows:
         return ()
     named = [f"{device} ({number(-times, 2)} times the noise)" for times, device in rows]
@@ -235,7 +235,7 @@ def verdict_table(findings: Sequence[Finding], scale: Scale) -> Table:
     columns.append((f"fitted, rms [{scale.unit}]", *fitted))
     shares = (f.errors[0].extended_percent if f.errors else f.rms_percent for f in findings)
     columns.append(("% of range", *("" if s is None else number(s, 2) for s in shares)))
-    misfit = ("" if f.missed is None else number(f.missed, 2) for f in findings)
+    misfit = ("" if f.noise_ratio is None else number(f.noise_ratio, 2) for f in findings)
     columns.append(("missed, times the noise", *misfit))
     top, *body = zip(*(c for c in columns if any(c[1:])), strict=True)
     return Table(top, tuple(body))

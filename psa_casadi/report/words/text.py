@@ -251,7 +251,7 @@ def left_table(posterior: Posterior) -> Table:
     rows = []
     for b in posterior.task.density.blocks:
         e, channel = posterior.task.experiments[b.record], posterior.task.channel(b)
-        samples, gain = str(int(e.at(b.channel).sum())), number(b.alike)
+        samples, gain = str(int(e.at(b.channel).sum())), number(b.correlation_time)
         rows.append((e.record.name, channel.column, number(b.level), channel.unit, samples, gain))
     head = ("record", "output", "rms left", "unit", "samples", "that count as one")
     return Table(head, tuple(rows))
