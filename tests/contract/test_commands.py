@@ -43,14 +43,6 @@ def test_the_version_is_that_of_the_package() -> None:
     assert done("--version").out == f"psa_casadi {psa.__version__}\n"
 
 
-def test_every_public_name_is_there_and_a_wrong_one_is_told() -> None:
-    for name in psa.__all__:
-        assert getattr(psa, name) is not None
-    assert set(dir(psa)) == set(psa.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'identfy'"):
-        psa.identfy  # noqa: B018
-
-
 def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
     code = "import sys, psa_casadi; print([m for m in ('casadi', 'numpy') if m in sys.modules])"
     statement = subprocess.run(
