@@ -12,8 +12,8 @@ from psa_casadi.cli.inputs import Given
 from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, tell_written, working
+from psa_casadi.display import with_units
 from psa_casadi.errors import Problems
-from psa_casadi.shown import with_units
 from psa_casadi.units import FloatArray, convert
 
 

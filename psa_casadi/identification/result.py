@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.display import Reported, frame, made
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
@@ -16,7 +17,6 @@ from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment, noise_share
-from psa_casadi.shown import Reported, frame, made
 from psa_casadi.strict_json import json_text
 from psa_casadi.variables import Interval, Provenance
 from psa_casadi.version import __version__

@@ -149,7 +149,7 @@ def _run(
     how: Any = {"unknowns": () if s0 is None else FREE, "s0": s0, "outputs": (_OUTPUT,)}
     if way == EXACT:
         exact = run_exact(model, t, u, x0, tolerance=tolerance, **how)
-        return exact.shown[:, 0], exact.steps
+        return exact.requested[:, 0], exact.steps
     result = psa.run(model, t, u, x0, rtol=tolerance, **how)
     return result.y[:, model.output_names.index(_OUTPUT)], result.steps
 
@@ -218,7 +218,7 @@ def _lanes(task: Task, tolerance: float, repeats: int, progress: Progress) -> Ti
     single = partial(run_exact, outputs=(_OUTPUT,), **how)
     singles = [partial(single, m, *inputs, x) for m, x in zip(models, starts, strict=True)]
     many = psa.simulate_many(task.model, sets, task.record, rtol=tolerance)
-    for others in (np.array([one().shown[:, 0] for one in singles]), many):
+    for others in (np.array([one().requested[:, 0] for one in singles]), many):
         if not np.array_equal(together().T, others):
             raise psa.PsaError("A set has other bits in a lane than by itself.")
     side, *alone = (

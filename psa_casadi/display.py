@@ -25,7 +25,7 @@ def made(what: str, *inputs: Any, **options: Any) -> Any:
 
 
 class Worded:
-    """What says itself in a sentence."""
+    """A result with a sentence in words."""
 
     @property
     def sentence(self) -> str:
@@ -64,11 +64,7 @@ class Lined(Celled):
         return str(made("line", self))
 
 
-class Shown(Plotted, Lined):
-    """What a result can show of itself: a line, a notebook's cell, a picture."""
-
-
-class Reported(Shown):
+class Reported(Plotted, Lined):
     """What a result can show of itself that has a page of its own."""
 
     def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
