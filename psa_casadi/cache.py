@@ -1,7 +1,7 @@
 """The user's cache of what takes long to make; what in it is damaged or not the user's is not used.
 
-Every file has its checksum beside it. A cache that cannot be used is replaced by a folder that goes
-with this process, and one line says so.
+Every file has its checksum beside it. If the cache cannot be used, a folder that
+goes with this process replaces it, and one line warns of it.
 """
 
 import atexit
@@ -44,7 +44,7 @@ def _wanted() -> Path:
         base = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     elif platform.system() == "Darwin":
         base = Path.home() / "Library" / "Caches"
-    else:  # as its specification says
+    else:  # XDG base directory specification
         base = Path(os.environ.get("XDG_CACHE_HOME", ""))
         base = base if base.is_absolute() else Path.home() / ".cache"
     return base / "psa_casadi"
@@ -164,7 +164,7 @@ def _make_ours(room: Path) -> None:
 
 
 def _demand_ours(path: Path, status: os.stat_result, *, sticky: bool = False) -> None:
-    """Demand that none but the user and root can have changed a file or folder, where one can tell.
+    """Demand that none but the user and root can have changed a file or folder (POSIX only).
 
     In a `sticky` folder others may make files, and leave those of the user alone.
     """

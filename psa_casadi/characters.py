@@ -14,20 +14,20 @@ _OBEYED = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u202a-\u202e\
 
 def barred(text: str) -> str:
     """Return the first character that no document can carry, as in "U+0000"; else nothing."""
-    result = _BARRED.search(text)
-    return f"U+{ord(result[0]):04X}" if result else ""
+    match = _BARRED.search(text)
+    return f"U+{ord(match[0]):04X}" if match else ""
 
 
 def check_text(text: str, what: str) -> None:
     """Refuse a text with a character that no document can carry; `what` begins the sentence.
 
     Raises:
-        InputError: there is one; the sentence names it and shows what stands before it.
+        InputError: there is one; the sentence names it and quotes the text before it.
     """
-    if result := _BARRED.search(text):
-        before = " ".join(text[max(0, result.start() - 40) : result.start()].split())
+    if match := _BARRED.search(text):
+        before = " ".join(text[max(0, match.start() - 40) : match.start()].split())
         raise InputError(
-            f"{what} has the character {barred(result[0])} after '{before}', which no document can"
+            f"{what} has the character {barred(match[0])} after '{before}', which no document can"
             " carry; remove it from the names, descriptions and notes of the model."
         )
 
@@ -39,4 +39,4 @@ def plain(text: str) -> str:
 
 def visible(text: str) -> str:
     """Return a text as a terminal may show it: what it would obey is spelled out as an escape."""
-    return _OBEYED.sub(lambda result: result[0].encode("unicode_escape").decode(), text)
+    return _OBEYED.sub(lambda match: match[0].encode("unicode_escape").decode(), text)

@@ -1,7 +1,7 @@
 """Child processes that do not outlive this one: programs, and Pythons for what may crash.
 
 Each is the leader of a group of its own, and killed with it when the block that started it ends, or
-by `end_children`, for a process that is told to stop.
+by `end_children`, for a process that has to stop.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ _LOOK = 0.1
 _PR_SET_PDEATHSIG = 1
 
 _CHILDREN: set[Child] = set()
-#: What stands for each child that is being started, and what waits until it is among the children.
+#: A token for each child that is being started; functions to call when all are among the children.
 _STARTING: set[object] = set()
 _WAITING: list[Callable[[], None]] = []
 
@@ -74,7 +74,7 @@ def started_python(
         MachineError: it cannot be started.
     """
     root = str(Path(__file__).resolve().parents[1])
-    # without "", the current folder: a file that lies there stands for no module
+    # without "", the current folder: a file there must not replace a module
     paths = os.pathsep.join(os.path.abspath(p) for p in (*sys.path, root) if p)
     command = [sys.executable, "-P", "-m", module, *arguments]
     environment = {**os.environ, "PYTHONPATH": paths, **variables}
@@ -98,9 +98,9 @@ def end_with_parent() -> None:
 
 
 def heard(child: Child, *, limit: float | None = None) -> subprocess.CompletedProcess[bytes]:
-    """Return what a child said on its two streams until it ended.
+    """Return what a child writes on its two streams until it ends.
 
-    It is given nothing but its arguments: a pipe that is full when the first wait ends is never
+    It gets only its arguments: a pipe that is full when the first wait ends is never
     written to again (CPython 3.11 to 3.13).
 
     Raises:
@@ -111,15 +111,13 @@ def heard(child: Child, *, limit: float | None = None) -> subprocess.CompletedPr
     try:
         while True:
             try:
-                statement, complained = child.communicate(timeout=_LOOK)
+                streams = child.communicate(timeout=_LOOK)
             except subprocess.TimeoutExpired:
                 raise_if_stopped()
                 if end is not None and time.monotonic() > end:
                     raise
             else:
-                return subprocess.CompletedProcess(
-                    child.args, child.returncode, statement, complained
-                )
+                return subprocess.CompletedProcess(child.args, child.returncode, *streams)
     finally:
         kill(child)
         close_pipes(child)

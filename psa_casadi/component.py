@@ -33,13 +33,13 @@ Kind = Literal[
     "changing gain",
 ]  # fmt: skip
 
-#: Probe value that stands for "the frequencies where the residual's spectrum peaks", in Hz.
+#: Probe value: the frequencies where the residual's spectrum peaks, in Hz.
 SPECTRAL_PEAKS = "spectral_peaks"
 #: The same for the periods with which the residual repeats over the displacement, in m.
 DISPLACEMENT_PEAKS = "displacement_peaks"
 #: The same for the places at which the residual jumps over the displacement, in m.
 DISPLACEMENT_STEPS = "displacement_steps"
-#: Probe value that stands for the duration of the longest record, in s.
+#: Probe value: the duration of the longest record, in s.
 RECORD_DURATION = "record_duration"
 #: Those that are read off a residual.
 READ_OFF = (SPECTRAL_PEAKS, DISPLACEMENT_PEAKS, DISPLACEMENT_STEPS)
@@ -129,7 +129,7 @@ class Symbols:
 
 
 class OnDemand(Symbols):
-    """Symbols of any name, made when they are asked for; `made` are those that were."""
+    """Symbols of any name, made when they are first read; `made` are those so far."""
 
     def __init__(self) -> None:
         super().__init__({})
@@ -174,23 +174,22 @@ class Component:
     """One piece of physics, declared once and symbolically.
 
     `gain` names the parameter that removes the component exactly at 0 (None for base physics).
-    `linear` names parameters of which it is a factor: a fit holds the gain at 1 and moves them,
-    and the effect is looked for with all of them at once.
-    `probe` holds trial values of parameters that have no influence while the gain is 0;
-    `finite_step` is the size of the gain, as a share of its scale, at which the effect is looked
-    for when its derivative vanishes at 0. `looks_like` is the signature an engineer sees.
-    `kind` says what an effect does, whatever its place: the effects of one kind and place are a
-    family. `tone` names a parameter that is the frequency of a tone: among harmonics of a periodic
-    drive it cannot be told from distortion. `belongs_to` is plant, drive, sensor or environment;
-    the last two stay out of exported plants. `needs` names components without which this one
-    means nothing. `remedy` is what can be done about it, where that is more than its place says.
-    `trial_starts` are starts of its memory states at which it is looked for, where
-    it does nothing at their ordinary start. `curve` names the quantity over which an effect bends
-    a static curve, in a form of its own: effects with the same one differ, below the resonances,
-    by these forms only. `measured_by` names the input whose measured column holds what it adds:
-    with such a column it is no cause. `needs_column` names columns of which a record must have one
-    for the effect to be looked for, as it hardly shows otherwise. `more_of` names the effect of
-    which this one is several, `count` of them.
+    `linear` names parameters of which it is a factor: a fit holds the gain at 1 and moves them, and
+    the effect is looked for with all of them at once. `probe` holds trial values of parameters that
+    have no influence while the gain is 0; `finite_step` is the size of the gain, as a share of its
+    scale, at which the effect is looked for when its derivative vanishes at 0. `looks_like` is the
+    signature an engineer sees. `kind` is what an effect does, whatever its place: the effects of
+    one kind and place are a family. `tone` names a parameter that is the frequency of a tone: among
+    harmonics of a periodic drive it is indistinguishable from distortion. `belongs_to` is plant,
+    drive, sensor or environment; the last two stay out of exported plants. `needs` names components
+    without which this one means nothing. `remedy` is what can be done about it, if it differs from
+    that of its place. `trial_starts` are starts of its memory states at which it is looked for,
+    where it does nothing at their ordinary start. `curve` names the quantity over which an effect
+    bends a static curve, in a form of its own: effects with the same one differ, below the
+    resonances, by these forms only. `measured_by` names the input whose measured column holds what
+    it adds: with such a column it is no cause. `needs_column` names columns of which a record must
+    have one for the effect to be looked for, as it hardly shows otherwise. `more_of` names the
+    effect of which this one is several, `count` of them.
 
     `sampled` are states that change at sample instants only: at every time that is a multiple of
     the parameter `sample_period` [s], whoever declares it, each takes the value in
@@ -198,7 +197,7 @@ class Component:
     period.
 
     `home` is the module of a component that is not of this package (`own_effects`). `balances` are
-    sums of its own that others may add to, beside those of every model. `foreign` is what its
+    further sums that others may add to. `foreign` is what its
     equations call that is no formula; `played` is what is run as a whole in their place.
     """
 
@@ -269,7 +268,7 @@ class Component:
         return partial(Component, **declared), ()
 
     def at_gain(self, gain: float, values: Mapping[str, float]) -> dict[str, float]:
-        """Return `values` with a gain, as a fit has them: the `linear` ones times it, beside 1."""
+        """Return `values` with a gain, as a fit has them: the `linear` ones times it, and 1."""
         if not self.linear:
             return {**values, self.gain or "": gain}
         declared = {p.name: p.value for p in self.parameters}
@@ -278,8 +277,24 @@ class Component:
 
     @property
     def fitted(self) -> tuple[str, ...]:
-        """Names of the parameters that records can tell."""
+        """Names of the parameters that records can determine."""
         return tuple(p.name for p in self.parameters if p.fitted)
+
+    def is_inside_ranges(self, values: Mapping[str, float]) -> bool:
+        """Whether no fitted parameter but the gain lies at an end of its range.
+
+        A parameter whose lower bound is a limit of the law may lie there.
+        """
+        for p in self.parameters:
+            if not p.fitted or p.name == self.gain:
+                continue
+            low, high = (0.0, p.bounds[1]) if p.limit else p.bounds
+            value, margin = values[p.name], 1e-3 * (high - low)
+            if p.log and (value < 1.01 * low or value > high / 1.01):
+                return False
+            if not p.log and (value <= low + margin or value >= high - margin):
+                return False
+        return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,12 +323,12 @@ class KeptEquations:
         """Return the equations in these symbols."""
         results = self.function.call([getattr(s, name) for name in self.symbols])
         parts: dict[str, dict[str, Expression]] = {}
-        for (part, name), result in zip(self.places, results, strict=True):
-            parts.setdefault(part, {})[name] = result
+        for (part, name), expression in zip(self.places, results, strict=True):
+            parts.setdefault(part, {})[name] = expression
         return Equations(**parts)
 
 
 def _found(module: str, name: str, text: str | None, key: Any) -> Any:
-    """Return a component of a table, or of what a function makes of what is given."""
+    """Return a component of a table, or of the table that a function returns for `text`."""
     table = getattr(import_module(module), name)
     return (table if text is None else table(text))[key]

@@ -1,4 +1,4 @@
-"""What can go wrong for a user, said in sentences, all of it at once."""
+"""Errors for users: sentences, with all mistakes of an input at once."""
 
 from collections.abc import Iterable, Sequence
 
@@ -39,7 +39,7 @@ def quoted(names: Iterable[str]) -> str:
 class Problems:
     """Collects the mistakes of one input so that the user sees them all in one message.
 
-    At most `limit` sentences are kept; the others are counted and the last line says how many.
+    At most `limit` sentences are kept; the last line counts the others.
     """
 
     def __init__(self, limit: int = 20) -> None:
@@ -56,8 +56,13 @@ class Problems:
         if len(self._kept) < self._limit:
             self._kept.append(sentence)
 
+    def extend(self, sentences: Iterable[str]) -> None:
+        """Note several mistakes."""
+        for sentence in sentences:
+            self.add(sentence)
+
     def add_uncounted(self, number: int) -> None:
-        """Note that `number` more mistakes of a kind already noted were found."""
+        """Count `number` more mistakes of a kind that is noted already."""
         self._count += number
 
     def sentences(self) -> tuple[str, ...]:

@@ -25,15 +25,15 @@ from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
 
 
-def _told_of(item: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add to a function's help what it is for a model of one's own."""
+def _with_help_of(work: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add to a function's help that of the function for a model of one's own."""
 
-    def told(face: Callable[..., Any]) -> Callable[..., Any]:
-        words = f"Of a model of your own, {face.__name__}{signature(item)}:\n\n    {item.__doc__}"
+    def documented(face: Callable[..., Any]) -> Callable[..., Any]:
+        words = f"Of a model of your own, {face.__name__}{signature(work)}:\n\n    {work.__doc__}"
         face.__doc__ = f"{face.__doc__}\n    {words}"
         return face
 
-    return told
+    return documented
 
 
 @overload
@@ -58,10 +58,10 @@ def identify(
     progress: Progress = ...,
 ) -> Identification: ...
 @on_a_terminal
-@_told_of(identify_ode)
+@_with_help_of(identify_ode)
 @wraps(stack.identify)
 def identify(*inputs: Any, **words: Any) -> Any:
-    """Identify a stack from its records, or a model of one's own, given first, from its."""
+    """Identify a stack from its records, or a model of one's own, the first argument, from its."""
     model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return stack.identify(records, model=model, **_known(words, stack.identify))
@@ -97,10 +97,10 @@ def diagnose(
     progress: Progress = ...,
 ) -> Diagnosis: ...
 @on_a_terminal
-@_told_of(diagnose_ode)
+@_with_help_of(diagnose_ode)
 @wraps(diagnosis.diagnose)
 def diagnose(*inputs: Any, **words: Any) -> Any:
-    """Diagnose a stack's records, or a model of one's own, given first, on its records."""
+    """Diagnose a stack's records, or a model of one's own, the first argument, on its."""
     model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return diagnosis.diagnose(records, model=model, **_known(words, diagnosis.diagnose))
@@ -115,11 +115,11 @@ def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, 
 
 def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
     """Return the words for a piece of work. Raises InputError for one that it does not take."""
-    items = [n for n in signature(work).parameters if n not in ("model", "records")]
+    names = [n for n in signature(work).parameters if n not in ("model", "records")]
     for word in words:
-        if word not in items:
-            what = "a model of your own" if "known_start" in items else "a stack"
-            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(items)}.")
+        if word not in names:
+            what = "a model of your own" if "known_start" in names else "a stack"
+            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(names)}.")
     return words
 
 

@@ -1,7 +1,7 @@
 """Output files that are written whole or not at all, and what does not outlive its process.
 
 What a block made goes when the block ends; `abandon` removes all of it at once, and ends all child
-processes, for a process that is told to stop. What a killed process left goes with the next one
+processes, for a process that has to stop. What a killed process left goes with the next one
 that writes to the same place: a process holds a lock on each thing it made, and the operating
 system frees the lock when it dies. Where there are no locks (Windows, some network drives), what is
 older than a week counts as left.
@@ -31,7 +31,8 @@ if sys.platform != "win32":
 PREFIX = ".psa_casadi-"
 #: Age [s] after which a thing that cannot be locked counts as left.
 _OLD = 7 * 86400.0
-#: A name beside the prefix and the random part; a file system takes 255 bytes, a letter up to 4.
+#: Characters of a name after the prefix and the random part; a file system takes 255 bytes, a
+#: letter up to 4.
 _LONGEST = 50
 #: Requests to end that a process is sent, where the system has them; Ctrl-C raises by itself.
 _REQUESTS = ("SIGTERM", "SIGHUP", "SIGBREAK")
@@ -204,14 +205,14 @@ _WRITTEN: list[Path] = []
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a path to write to, beside `path`; it takes the place of `path` if the block ends well.
+    """Yield a path in the folder of `path` to write to; it replaces `path` if the block ends well.
 
     If the block raises, or the process is killed, a file that stood at `path` stays as it was. What
     the block wrote is removed, after a kill by the next that writes to the folder. A link is
     followed. A device or a pipe (`/dev/stdout`) cannot be replaced and is yielded itself.
 
     Raises:
-        InputError: `path` cannot be written to; the sentence says why.
+        InputError: `path` cannot be written to, with the reason.
     """
     reason = why_not_written(path)
     if reason:
@@ -237,7 +238,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def written() -> tuple[Path, ...]:
-    """Return the files that this process has written whole, by the names they were given."""
+    """Return the files that this process has written whole, by the names that callers gave."""
     return tuple(_WRITTEN)
 
 
@@ -245,14 +246,14 @@ def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:
     """Write `data` to `path`, whole or not at all; text is written as UTF-8 with its own line ends.
 
     Raises:
-        InputError: `path` cannot be written to, or the text cannot be; the sentence says why.
+        InputError: `path` cannot be written to, or the text cannot be, with the reason.
     """
     try:
         content = data.encode() if isinstance(data, str) else data
     except UnicodeEncodeError as error:
-        result = ord(error.object[error.start])
+        code = ord(error.object[error.start])
         raise InputError(
-            f"{path}: cannot write, the text has the character U+{result:04X}, which UTF-8 does not"
+            f"{path}: cannot write, the text has the character U+{code:04X}, which UTF-8 does not"
             " have; remove it from names and descriptions."
         ) from error
     with atomic_path(path) as temporary:
@@ -272,8 +273,8 @@ def why_not_written(path: str | os.PathLike[str]) -> str | None:
             )
         target.exists()
     except (OSError, RuntimeError) as error:  # a name too long; links that lead in a circle
-        statement = error.strerror if isinstance(error, OSError) else error
-        return f"{path}: cannot write ({statement}); choose another name."
+        reason = error.strerror if isinstance(error, OSError) else error
+        return f"{path}: cannot write ({reason}); choose another name."
     return None
 
 
@@ -297,8 +298,8 @@ def why_not_read(error: Exception) -> str:
         return "there is no such file"
     if isinstance(error, UnicodeDecodeError):
         return "it is no text in UTF-8"
-    statement = error.strerror if isinstance(error, OSError) else None
-    return statement.lower() if statement else str(error)
+    reason = error.strerror if isinstance(error, OSError) else None
+    return reason.lower() if reason else str(error)
 
 
 def replace_durably(temporary: Path, target: Path) -> None:

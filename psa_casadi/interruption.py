@@ -10,34 +10,45 @@ import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+@contextmanager
+def set_within(variable: ContextVar[Any], value: T) -> Iterator[T]:
+    """Set a context variable while the block runs, and yield its value."""
+    token = variable.set(value)
+    try:
+        yield value
+    finally:
+        variable.reset(token)
 
 
 class Work:
-    """What one interrupt ends: everything that runs in one context, and in its threads."""
+    """What one interrupt ends: everything that runs in one context, and in its threads.
+
+    `flag` is an int for compiled code that is not 0 after `stop`.
+    """
 
     def __init__(self) -> None:
-        self._flag = ctypes.c_int(0)
+        self.flag = ctypes.c_int(0)
         self._wrapping_up = False
-
-    @property
-    def address(self) -> int:
-        """Address of the flag, for compiled code: an int that is not 0 after `stop`."""
-        return ctypes.addressof(self._flag)
 
     @property
     def stopped(self) -> bool:
         """Whether the work is to end."""
-        return bool(self._flag.value)
+        return bool(self.flag.value)
 
     def stop(self) -> None:
         """End the work, but for what is done after `wrap_up`."""
         if not self._wrapping_up:
-            self._flag.value = 1
+            self.flag.value = 1
 
     def wrap_up(self) -> None:
         """Let what follows run in spite of the interrupt; a further one does not set the flag."""
         self._wrapping_up = True
-        self._flag.value = 0
+        self.flag.value = 0
 
 
 _WORK: ContextVar[Work | None] = ContextVar("work", default=None)
@@ -46,15 +57,12 @@ _WORK: ContextVar[Work | None] = ContextVar("work", default=None)
 @contextmanager
 def interruptible_work() -> Iterator[Work]:
     """Make what runs inside one work, or part of the work that it is in; also a decorator."""
-    item = _WORK.get()
-    if item is not None:
-        yield item
+    work = _WORK.get()
+    if work is not None:
+        yield work
         return
-    token = _WORK.set(Work())
-    try:
-        yield current_work()
-    finally:
-        _WORK.reset(token)
+    with set_within(_WORK, Work()) as work:
+        yield work
 
 
 def current_work() -> Work:
@@ -63,9 +71,9 @@ def current_work() -> Work:
 
 
 def flag_address() -> int | None:
-    """Return the address of this work's flag for compiled code, None where there is no work."""
-    item = _WORK.get()
-    return None if item is None else item.address
+    """Return the address of this work's flag for compiled code, None without work."""
+    work = _WORK.get()
+    return None if work is None else ctypes.addressof(work.flag)
 
 
 def raise_if_stopped() -> None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from psa_casadi.shown import made
+from psa_casadi.display import made
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ __all__ = [
     "stack_values",
 ]
 
-#: A displacement beyond so many strokes of the stack is no wish in metres.
+#: A wanted displacement beyond this many strokes of the stack is not in metres.
 _STROKES = 10.0
 
 
@@ -75,9 +75,9 @@ class Block:
         out = ca.substitute(out, s.z, after)
         self._function = ca.Function("recursion", [s.z, s.u], [after, out], {"cse": True})
         self._kept = (np.array(kept, dtype=float), np.array(kept, dtype=float))
-        inputs, displayed = np.zeros(s.u.numel()), np.zeros(s.y.numel())
+        inputs, outputs = np.zeros(s.u.numel()), np.zeros(s.y.numel())
         self._given: Any = inputs.data
-        self._out: Any = displayed.data
+        self._out: Any = outputs.data
         # bound to memory twice: each reads from one copy and writes to the other
         self._bound: Any = [self._function.buffer() for _ in self._kept]
         for source, (buffer, _) in enumerate(self._bound):
@@ -220,7 +220,7 @@ def identifier_for(
     `period` [s] is its sample period, `noise` [m] the rms error of the measured displacement and of
     the model (the smaller, the faster and the rougher the estimates), `memory` [s] the time over
     which it forgets, `spread` how far the stack's parameters may be off, as a share. The
-    voltage that it is given is the command, or, with `at_electrodes`, that at the electrodes.
+    voltage input is the command, or, with `at_electrodes`, that at the electrodes.
 
     Raises InputError if the model is no stack of the paper, or beta does not exceed gamma.
     """
@@ -265,8 +265,8 @@ class OnlineIdentification(_Learning):
 
     A streaming object: one sample in, one out. `values` are the parameters of the component of the
     same name, for instance `identifier_for(model, period, noise=...).values`. See
-    `psa_casadi.components.online_identification` for the equations and for what is done when the
-    voltage stands still.
+    `psa_casadi.components.online_identification` for the equations and for what is done while the
+    voltage is held.
     """
 
     _component = ONLINE_IDENTIFICATION
@@ -304,7 +304,7 @@ class AdaptiveFeedForward(_Learning, Following):
         return self._follow(self._per_volt * wanted)
 
 
-#: The rms error of sensor and model as a share of the stroke, where none is given.
+#: The rms error of sensor and model as a share of the stroke, by default.
 _NOISE = 1e-3
 _OBSERVING = ("hysteresis_observer", "feed_forward")
 _LEARNING = ("online_identification", "adaptive_feed_forward")
@@ -314,7 +314,7 @@ _TUNED = ("position_controller", "hysteresis_compensator", *_OBSERVING, *_LEARNI
 def part_for(
     name: str, stack: Model | None = None, *, period: float, noise: float | None = None
 ) -> Model:
-    """Return a part by name that acts every `period` [s], tuned to a stack if one is given.
+    """Return a part by name that acts every `period` [s], tuned to `stack` if it is not None.
 
     The position controller is that of `nanopositioner` around the stack. Observers, feed-forward
     and identification have the stack's values; they see the command, amplifier included. `noise`

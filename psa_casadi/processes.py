@@ -31,7 +31,7 @@ class Processes:
         return self._pool.submit(self._called, function, argument)
 
     def end(self) -> None:
-        """Kill the processes, and leave out what has not begun."""
+        """Kill the processes, and leave out what has not started."""
         self._ended = True
         self._held.close()
         self._pool.shutdown(cancel_futures=True)
@@ -51,11 +51,11 @@ class Processes:
         except (EOFError, OSError, pickle.UnpicklingError):
             del self._own.child
             code = child.wait()
-            statement = "" if child.stderr is None else child.stderr.read().decode(errors="replace")
+            complaint = "" if child.stderr is None else child.stderr.read().decode(errors="replace")
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise MachineError(
                 f"The process that worked on this ended ({how}): killed, out of memory, or"
-                f" crashed. The next run tries it again. {statement[-500:]}"
+                f" crashed. The next run tries it again. {complaint[-500:]}"
             ) from None
 
 

@@ -1,8 +1,9 @@
-"""What long work tells while it runs, on a terminal where it is given nothing else."""
+"""On a terminal: the command that was typed, and the progress of long work."""
 
 import shutil
 import sys
 from collections.abc import Callable
+from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -10,15 +11,18 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Progress = Callable[[str], None]
 
+#: The command that runs, as it was typed, which pages and files quote; empty in Python.
+typed: ContextVar[str] = ContextVar("typed", default="")
+
 _CLEAR = "\r\x1b[K"
 
 
 def silent(step: str) -> None:
-    """Tell nothing."""
+    """Show nothing."""
 
 
 def on_a_terminal(work: Callable[P, R]) -> Callable[P, R]:
-    """Return long work that shows its `progress` on one line of the terminal, if it is given none.
+    """Return long work that shows its `progress` on one line of the terminal by default.
 
     The line is that of stderr, cut to the terminal's width, and goes when the work ends. Where
     stderr is no terminal, nothing is written.
@@ -30,14 +34,14 @@ def on_a_terminal(work: Callable[P, R]) -> Callable[P, R]:
         if "progress" in words or not sys.stderr.isatty():
             return work(*inputs, **words)
 
-        def tell(step: str) -> None:
+        def show_step(step: str) -> None:
             room = shutil.get_terminal_size().columns - 1
             sys.stderr.write(f"{_CLEAR}{f'{name}: {step}'[:room]}")
             sys.stderr.flush()
 
-        output: Any = {**words, "progress": tell}
+        with_progress: Any = {**words, "progress": show_step}
         try:
-            return work(*inputs, **output)
+            return work(*inputs, **with_progress)
         finally:
             sys.stderr.write(_CLEAR)
             sys.stderr.flush()

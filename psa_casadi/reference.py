@@ -48,7 +48,7 @@ _FAILURE = (
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The response at the times asked for; every array has the shape of `times`.
+    """The response at the requested times; every array has the shape of `times`.
 
     `states` maps u [V], f_H [N], f_out [N], y [m], v_y [m/s] (cascade only), x [m], v_x [m/s]. The
     other fields are in m, m/s, A, C, N; `blocked_force` would hold the output at zero. At a jump,

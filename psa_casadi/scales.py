@@ -21,6 +21,11 @@ def force_scale(p: Values) -> float:
     return abs(p["k_L"]) * voltage_scale(p)
 
 
+def hysteresis_scale(p: Values) -> float:
+    """Usual size of a hysteresis force, a tenth of the force at rated voltage [N]."""
+    return 0.1 * abs(p["k_L"]) * abs(p["u_rated"])
+
+
 def stiffness_scale(p: Values) -> float:
     """Series stiffness of wafers and bonding layers, or the single stiffness [N/m]."""
     if "k_B" in p:

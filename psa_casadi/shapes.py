@@ -1,14 +1,15 @@
-"""Shapes that equations are made of: smooth signs, plays, and a bent curve."""
+"""What components are made of: smooth signs, plays, a bent curve; parameters and states."""
 
 import math
 from collections.abc import Sequence
 from math import pi
+from typing import Any
 
 import casadi as ca
 
 from psa_casadi.component import Expression, Symbols
-from psa_casadi.scales import stop_scale, voltage_scale
-from psa_casadi.variables import Parameter, State
+from psa_casadi.scales import stop_scale, stroke_scale, voltage_scale
+from psa_casadi.variables import Nominal, Parameter, State
 
 #: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
 _SHARPNESS = 4.0
@@ -101,7 +102,7 @@ def stop_state(name: str, description: str) -> State:
 
 
 def stop_states(prefix: str, thresholds: Sequence[str]) -> tuple[State, ...]:
-    """Return the states of stop elements, whose thresholds are told in words."""
+    """Return the states of stop elements, whose thresholds are described in words."""
     return tuple(
         stop_state(f"{prefix}{i}", f"stop element {i}, threshold {threshold}")
         for i, threshold in enumerate(thresholds, 1)
@@ -129,7 +130,7 @@ def spectrum_force(
 def spectrum_parameters(
     prefix: str, counts: Sequence[int], plays: Sequence[float]
 ) -> list[Parameter]:
-    """Return the weights of `spectrum_force`; the first ones of the `plays` begin as given.
+    """Return the weights of `spectrum_force`; the first ones of the plays start at `plays`.
 
     The k-th cosine has a scale of 1/(k + 1), so that the prior prefers smooth spectra.
     """
@@ -200,3 +201,33 @@ def shape_parameters(prefix: str) -> tuple[Parameter, Parameter]:
             f"{prefix}_wave", 0.0, "1", (-20.0, 20.0), "quartic (W) part over bow and S", scale=0.1
         ),
     )
+
+
+def share(
+    name: str, bounds: tuple[float, float], description: str, scale: Nominal, value: float = 0.0
+) -> Parameter:
+    """Return a parameter without a dimension; `scale` is the size of an ordinary change."""
+    return Parameter(name, value, "1", bounds, description, scale=scale)
+
+
+def positive(
+    name: str,
+    value: float,
+    unit: str,
+    bounds: tuple[float, float],
+    description: str,
+    *,
+    limit: bool = False,
+) -> Parameter:
+    """Return a parameter that spans decades; `limit` as in `Parameter`."""
+    return Parameter(name, value, unit, bounds, description, log=True, limit=limit)
+
+
+def form(name: str, description: str) -> Parameter:
+    """Return what chooses between two forms, 0 and 1; it is tried and not fitted."""
+    return Parameter(name, 0.0, "1", (0.0, 1.0), description, fitted=False)
+
+
+def motion(name: str, description: str, scale: Nominal = stroke_scale, **more: Any) -> State:
+    """Return a displacement as a state; `more` as in `State`."""
+    return State(name, "m", description, scale, display_unit="um", **more)

@@ -1,7 +1,7 @@
 """JSON files: read strictly, checked against the records that declare them, written back the same.
 
 A file's form is a frozen dataclass; msgspec converts the content to it and makes its schema. JSON
-that is read says one thing only: no name twice, no number or text that cannot be written again.
+that is read is unambiguous: no name twice, no number or text that cannot be written again.
 """
 
 import json
@@ -34,12 +34,12 @@ _WANTED = {
     bool: "true or false",
     type(None): "null",
 }
-#: Stands for what a content lacks; it is of no type that JSON has.
+#: The value of what a content lacks, of no type that JSON has.
 _LACKING = object()
 
 
 def read_json(path: str | os.PathLike[str], advice: str, source: str = "") -> Any:
-    """Return the content of a JSON file, which messages call `source` if that is given.
+    """Return the content of a JSON file, which messages call `source`, by default its path.
 
     Raises:
         InputError: it cannot be read, is no UTF-8 text, has more than `MOST_BYTES`, or is not what
@@ -82,8 +82,7 @@ def decode(kind: type[Record], content: Any, source: str) -> Record:
         InputError: every part that is missing or of another type, at most 20 of them.
     """
     problems = Problems()
-    for sentence in mistakes(kind, content):
-        problems.add(f"{source}: {sentence}")
+    problems.extend(f"{source}: {sentence}" for sentence in mistakes(kind, content))
     problems.raise_if_any()
     return msgspec.convert(content, kind)
 
@@ -103,7 +102,7 @@ def mistakes(kind: Any, content: Any, place: str = "") -> Iterator[str]:
     except msgspec.ValidationError:
         inside = [m for p, k, value in _parts(kind, content, place) for m in mistakes(k, value, p)]
         name = f"'{place}'" if place else "the file"
-        result = "missing" if content is _LACKING else shown(content)
+        result = "missing" if content is _LACKING else brief(content)
         yield from inside or [f"{name} is {result}; give {_wanted(kind)}."]
 
 
@@ -163,7 +162,7 @@ def plain(value: Any) -> Any:
 def json_text(content: Any) -> str:
     """Return the text of a JSON file that `parse_json` reads back as the same content.
 
-    A list of numbers stands on one line.
+    A list of numbers takes one line.
 
     Raises:
         ValueError: a number is not finite, or a text has a character that no document can carry.
@@ -177,10 +176,10 @@ def check_texts(content: Any) -> None:
     """Raise ValueError for a text with a character that no document can carry."""
     for text in _texts(content):
         if result := barred(text):
-            raise ValueError(f"the text {shown(text)} has the character {result}")
+            raise ValueError(f"the text {brief(text)} has the character {result}")
 
 
-def shown(value: object) -> str:
+def brief(value: object) -> str:
     """Return a value as a sentence quotes it, cut off where it is long."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:80]}..."
@@ -190,7 +189,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
         twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-        raise ValueError(f"the name {shown(twice)} stands twice in one object")
+        raise ValueError(f"the name {brief(twice)} stands twice in one object")
     return table
 
 
@@ -201,7 +200,7 @@ def _constant(word: str) -> Any:
 def _number(digits: str) -> float:
     value = float(digits)
     if not math.isfinite(value):
-        raise ValueError(f"the number {shown(digits)} is too large")
+        raise ValueError(f"the number {brief(digits)} is too large")
     return value
 
 

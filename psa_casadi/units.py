@@ -70,7 +70,7 @@ class Unit:
 
 _POWERS = {"p": -12, "n": -9, "u": -6, "m": -3, "": 0, "k": 3, "M": 6, "G": 9}
 
-# symbol, quantity, prefixes in use beside none, exponents of kg m s A K mol cd rad
+# symbol, quantity, prefixes in use other than none, exponents of kg m s A K mol cd rad
 _SI_UNITS: tuple[tuple[str, str, str, Exponents], ...] = (
     ("s", "time", "num", (0, 0, 1, 0, 0, 0, 0, 0)),
     ("V", "voltage", "umk", (1, 2, -3, -1, 0, 0, 0, 0)),
@@ -144,7 +144,7 @@ def units_of(quantity: str) -> tuple[str, ...]:
 def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
     """Return the unit that an FMI-style unit string names.
 
-    In a compound a temperature is a difference: `V/degC` has no offset. `quantity` says what the
+    In a compound a temperature is a difference: `V/degC` has no offset. `quantity` is what the
     unit is meant to measure ("voltage"), so that the message on an unknown unit lists the right
     ones; it does not restrict the result. `common` restricts it to the symbols of the table.
 

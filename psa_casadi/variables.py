@@ -13,11 +13,11 @@ class Parameter:
     """A constant of the model that a user may tune between steps (FMI: parameter, tunable).
 
     `value` is the default in SI units, `bounds` the closed interval that is physically meaningful,
-    `log` says that the parameter spans decades and is searched on a logarithmic scale.
-    `scale` is the size of an ordinary change in SI units, where the value itself may be zero.
-    What is not `fitted` only sets a scale, or chooses between two forms; records never tell it.
-    `limit` says that the lower end of the bounds is a form of its own (a corner that is sharp, a
-    filter of one pole): a value there is as good as any other.
+    `log`: the parameter spans decades and is searched on a logarithmic scale. `scale` is the size
+    of an ordinary change in SI units, where the value itself may be zero. What is not `fitted` only
+    sets a scale, or chooses between two forms; records never determine it. `limit`: the lower end
+    of the bounds is a form of its own (a corner that is sharp, a filter of one pole): a value there
+    is as good as any other.
     """
 
     name: str
@@ -46,10 +46,10 @@ class State:
     A state with `memory` remembers a history that the record does not show (hysteresis, creep): its
     deviation from rest at the start of a record is unknown and is estimated; all others of a stack
     start at rest. Those of a model of one's own are all estimated, as deviations from `start`,
-    unless the start is said to be known. A memory that `settles` (creep) has an equilibrium; one
+    unless the start is declared known. A memory that `settles` (creep) has an equilibrium; one
     that does not (hysteresis) rests at any value.
     `nominal` is the size the state usually has, a number or a function of the parameter values.
-    Exact steps hold its error against `whole`, where that is given: a stop element is a part of
+    Exact steps hold its error against `whole`, if it is not None: a stop element is a part of
     the voltage, and shows by a share of what the voltage does.
     """
 
@@ -62,11 +62,6 @@ class State:
     memory: bool = False
     settles: bool = True
     whole: Nominal | None = None
-
-    @property
-    def errs_over(self) -> Nominal:
-        """The size against which an error counts."""
-        return self.nominal if self.whole is None else self.whole
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ class Interval(NamedTuple):
 class Provenance:
     """Where a model's values come from: records, package version, what was free, how sure.
 
-    `interrupted` says that they are those of a search that did not come to its end.
+    `interrupted`: they are those of a search that did not come to its end.
     """
 
     identified_from: tuple[tuple[str, str], ...] = ()
@@ -117,7 +112,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Publication:
-    """Who made a model, which version it is, and on what terms it is passed on; "" if not said.
+    """Who made a model, which version it is, and on what terms it is passed on; "" if not stated.
 
     The terms are those of the model and its values. The C code of an exported model has its own.
     """
@@ -129,7 +124,7 @@ class Publication:
 
     @property
     def stated(self) -> dict[str, str]:
-        """What is said, by the names of the fields."""
+        """The texts that are not empty, by the names of the fields."""
         return {name: text for name, text in asdict(self).items() if text}
 
 

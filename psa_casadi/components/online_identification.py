@@ -15,7 +15,7 @@ from itertools import islice
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.scales import voltage_scale
+from psa_casadi.scales import hysteresis_scale, voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
 #: Parameters that are tracked, in the order of z, and the unit of each.
@@ -248,14 +248,14 @@ def correct(
     variance = c.noise_square
     g: list[Expression] = []
     new: list[list[Expression]] = []
-    for j, (*above, item) in enumerate(m.factors):
+    for j, (*above, diagonal) in enumerate(m.factors):
         f = gate * (sum((u * b for u, b in zip(above, d, strict=False)), d[j]))
-        v, before = item * f, variance
+        v, before = diagonal * f, variance
         variance += f * v
         new.append(
             [
                 *(u - f / before * k for u, k in zip(above, g, strict=True)),
-                item * (before / variance),
+                diagonal * (before / variance),
             ]
         )
         g = [*(k + u * v for k, u in zip(g, above, strict=True)), v]
@@ -265,8 +265,8 @@ def correct(
     z = bounded(c, [a + step * b for a, b in zip(m.z, g, strict=True)])
     stretch = [ca.sqrt(1.0 + gate * c.forget * (1.0 - p)) for p in variances(new)]
     return z, [
-        [*(u * stretch[i] / stretch[j] for i, u in enumerate(above)), item * stretch[j] ** 2]
-        for j, (*above, item) in enumerate(new)
+        [*(u * stretch[i] / stretch[j] for i, u in enumerate(above)), diagonal * stretch[j] ** 2]
+        for j, (*above, diagonal) in enumerate(new)
     ]
 
 
@@ -293,26 +293,25 @@ def bounded(c: Constants, z: Sequence[Expression]) -> list[Expression]:
     return z
 
 
-def force_scale(p: Values) -> float:
-    """Return the size of a hysteresis force [N]."""
-    return 0.1 * abs(p["k_L"]) * p["u_rated"]
-
-
 def stroke(p: Values) -> float:
     """Return the displacement at the rated voltage, without hysteresis [m]."""
     return abs(p["k_L"]) * p["u_rated"] / p["stiffness"]
 
 
 _ESTIMATES = tuple(
-    Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else force_scale)
+    Output(f"{name}_hat", unit, f"estimate of {name}", 1.0 if unit != "N" else hysteresis_scale)
     for name, unit in TRACKED.items()
 )
-_FORCE = Output("hysteresis_force", "N", "estimated hysteresis force", force_scale)
+_FORCE = Output("hysteresis_force", "N", "estimated hysteresis force", hysteresis_scale)
 _CORRECTION = Output("correction", "V", "voltage to add so that the stack is linear", voltage_scale)
 _VOLTAGE_IN = Input("voltage", "V", "voltage at the stack", nominal=voltage_scale)
 _POSITION = Input("position", "m", "measured displacement", 0.0, stroke, "um")
 _UNITS = {"A": "V", "beta": "V", "gamma": "V", "delta": "V.s", "n": "N"}
 _MEANING = "of the covariance U D U' of the deviations"
+_LAST = (
+    State("u_last", "V", "voltage at the last instant", voltage_scale),
+    State("f_H", "N", "estimated hysteresis force", hysteresis_scale),
+)
 #: What the block keeps between instants, in the order of `flattened`.
 SAMPLED = (
     *(State(f"z_{n}", "1", f"deviation of {n} from its start, in spreads", 1.0) for n in TRACKED),
@@ -323,11 +322,10 @@ SAMPLED = (
         for j in range(COUNT)
         for i in range(j + 1)
     ),
-    State("u_last", "V", "voltage at the last instant", voltage_scale),
-    State("f_H", "N", "estimated hysteresis force", force_scale),
+    *_LAST,
     *(State(f"s_{n}", unit, f"derivative of f_H by {n}", 1.0) for n, unit in _UNITS.items()),
     State("u_lag", "V", "voltage behind the lag", voltage_scale),
-    State("f_lag", "N", "estimated hysteresis force behind the lag", force_scale),
+    State("f_lag", "N", "estimated hysteresis force behind the lag", hysteresis_scale),
     *(State(f"l_{n}", unit, f"s_{n} behind the lag", 1.0) for n, unit in _UNITS.items()),
 )
 
@@ -350,26 +348,21 @@ def _memory(s: Symbols) -> Memory:
 def _learnt(
     s: Symbols, c: Constants, voltage: Expression
 ) -> tuple[Memory, Memory, Equations, dict[str, Expression]]:
-    """Return the memory now and after a sample, what that says, and the estimates now."""
+    """Return the memory now and after a sample, the equations of that, and the estimates now."""
     now = _memory(s)
     after = advance(c, now, voltage, s.position)
-    result = dict(zip(TRACKED, estimates(c, now.z), strict=True))
-    table = {**{f"{name}_hat": value for name, value in result.items()}, "hysteresis_force": now.f}
-    names = [state.name for state in SAMPLED]
-    return (
-        now,
-        after,
-        Equations(next=dict(zip(names, flattened(after), strict=True)), out=table),
-        result,
-    )
+    estimated = dict(zip(TRACKED, estimates(c, now.z), strict=True))
+    following = dict(zip((state.name for state in SAMPLED), flattened(after), strict=True))
+    out = {f"{name}_hat": value for name, value in estimated.items()} | {"hysteresis_force": now.f}
+    return now, after, Equations(next=following, out=out), estimated
 
 
 def _online_identification(s: Symbols) -> Equations:
     c = _constants(s, _PARAMETERS)
-    now, _, statement, result = _learnt(s, c, s.voltage)
-    predicted = (result["k_L"] * now.nu + now.phi + result["offset"]) / c.stiffness
-    more = {"correction": -now.f / result["k_L"], "prediction_error": s.position - predicted}
-    return replace(statement, out={**statement.out, **more})
+    now, _, learning, theta = _learnt(s, c, s.voltage)
+    predicted = (theta["k_L"] * now.nu + now.phi + theta["offset"]) / c.stiffness
+    more = {"correction": -now.f / theta["k_L"], "prediction_error": s.position - predicted}
+    return replace(learning, out={**learning.out, **more})
 
 
 _PARAMETERS = (
@@ -427,10 +420,6 @@ _OBSERVING = tuple(
 )
 _VOLTAGE = Output("voltage", "V", "voltage at which the stack is where it is wanted", voltage_scale)
 _WANTED = Input("wanted", "m", "displacement that is wanted", 0.0, stroke, "um")
-_LAST = (
-    State("u_last", "V", "voltage at the last instant", voltage_scale),
-    State("f_H", "N", "estimated hysteresis force", force_scale),
-)
 _WANTED_LAST = State(
     "wanted_last", "m", "wanted displacement of the last instant", stroke, 0.0, "um"
 )
@@ -473,11 +462,11 @@ def _feed_forward(s: Symbols) -> Equations:
 def _adaptive(s: Symbols) -> Equations:
     """The voltage that was returned last has been applied when the displacement is measured."""
     c = _constants(s, ONLINE_IDENTIFICATION.parameters)
-    _, after, statement, _ = _learnt(s, c, s.applied)
+    _, after, learning, _ = _learnt(s, c, s.applied)
     u = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
     return Equations(
-        next={**statement.next, "applied": u, "wanted_last": s.wanted},
-        out={"voltage": s.applied, **statement.out},
+        next={**learning.next, "applied": u, "wanted_last": s.wanted},
+        out={"voltage": s.applied, **learning.out},
     )
 
 

@@ -1,8 +1,8 @@
-"""Further outputs of a stack: sensors beside that of the displacement, validity of the records.
+"""Further outputs of a stack: more sensors, and the validity of the records.
 
 They change nothing of a stack. A model has a sensor where a record has such a column: the scale is
-fitted, and a monitor stays in the exported model as an output. The validity tells how far a run has
-left what the records behind a model have shown, 0 inside.
+fitted, and a monitor stays in the exported model as an output. The validity is how far a run
+leaves the ranges of the records behind a model, 0 inside.
 """
 
 from functools import partial

@@ -1,5 +1,6 @@
 """The stack itself: drive, forces, hysteresis, lag, mechanics and an ideal sensor."""
 
+from psa_casadi import shapes
 from psa_casadi.component import Component, Equations, Symbols
 from psa_casadi.scales import (
     charge_scale,
@@ -8,16 +9,6 @@ from psa_casadi.scales import (
     stroke_scale,
     velocity_scale,
     voltage_scale,
-)
-from psa_casadi.shapes import (
-    direction,
-    magnitude_power,
-    rate_magnitude,
-    signed_power,
-    spectrum_force,
-    spectrum_parameters,
-    stop_rates,
-    stop_states,
 )
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
@@ -64,9 +55,9 @@ def _bouc_wen(s: Symbols) -> Equations:
     ratio = s.f_H / s.h_ref
     rate = (
         s.A * s.voltage_rate
-        - s.beta * rate_magnitude(s) * signed_power(ratio, s.n)
-        - s.gamma * s.voltage_rate * magnitude_power(ratio, s.n)
-        + s.delta * s.u * direction(s)
+        - s.beta * shapes.rate_magnitude(s) * shapes.signed_power(ratio, s.n)
+        - s.gamma * s.voltage_rate * shapes.magnitude_power(ratio, s.n)
+        + s.delta * s.u * shapes.direction(s)
     )
     return Equations(
         der={"f_H": s.hysteresis_rate},
@@ -272,11 +263,13 @@ _COUNTS = (5, 3, 3)
 
 
 def _memory_spectrum(s: Symbols) -> Equations:
-    """The hysteresis as a spectrum of elements: what stands in the place of Bouc-Wen's."""
-    elements, rates = stop_rates(s, "z_", [threshold * s.u_rated for threshold in _THRESHOLDS])
+    """The hysteresis as a spectrum of elements, in place of Bouc-Wen's."""
+    elements, rates = shapes.stop_rates(
+        s, "z_", [threshold * s.u_rated for threshold in _THRESHOLDS]
+    )
     return Equations(
         der=rates,
-        add={"free_force": s.k_L * spectrum_force(s, "", elements, _COUNTS)},
+        add={"free_force": s.k_L * shapes.spectrum_force(s, "", elements, _COUNTS)},
         switches={"voltage_reversal": s.voltage_rate},
     )
 
@@ -294,7 +287,7 @@ MEMORY_SPECTRUM = Component(
         "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  r_i = u_rated 2^(i-1)/80,  "
         "a_i = sum_k play_k cos(pi k (i - 1/2)/8),  b_i and c_i of square_k and cube_k likewise"
     ),
-    parameters=(*spectrum_parameters("", _COUNTS, (-0.03,)), HOLD_RATE),
-    states=stop_states("z_", [f"{r:g} of the rated voltage" for r in _THRESHOLDS]),
+    parameters=(*shapes.spectrum_parameters("", _COUNTS, (-0.03,)), HOLD_RATE),
+    states=shapes.stop_states("z_", [f"{r:g} of the rated voltage" for r in _THRESHOLDS]),
     equations=_memory_spectrum,
 )

@@ -1,4 +1,4 @@
-"""What stands around a stack: stage, amplifiers, mechanism, controller, compensator.
+"""The surroundings of a stack: stage, amplifiers, mechanism, controller, compensator.
 
 Both amplifiers have a limit of the current into their load, as one of the output's rate i_max/C.
 The compensator's observer runs eq. (8) on the voltage that it commands itself, as eq. (37) does:
@@ -13,7 +13,7 @@ from dataclasses import replace
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.scales import force_scale, voltage_scale
+from psa_casadi.scales import force_scale, hysteresis_scale, voltage_scale
 from psa_casadi.variables import Input, Output, Parameter, State, Values
 
 
@@ -273,7 +273,7 @@ _ON_WAFERS = Component(
     parameters=(_MOUNTED, *_MECHANISM),
     looks_like="more damping, resonances elsewhere, and a share of the stroke that is lost",
 )
-#: A mechanism around a stack in one model: its force acts where the key says.
+#: A mechanism around a stack in one model: its force acts at the key.
 PRESTRESS_MOUNTS = {
     "wafers": _ON_WAFERS,
     "tip": replace(
@@ -404,10 +404,6 @@ def _command_scale(p: Values) -> float:
     return voltage_scale(p) / abs(p["drive_gain"])
 
 
-def _force_scale(p: Values) -> float:
-    return 0.1 * abs(p["k_L"]) * voltage_scale(p)
-
-
 HYSTERESIS_COMPENSATOR = Component(
     name="hysteresis_compensator",
     description="observer of the hysteresis force, fed back to make the stack linear",
@@ -431,6 +427,6 @@ HYSTERESIS_COMPENSATOR = Component(
     inputs=(Input("command", "V", "command for a linear stack", nominal=_command_scale),),
     outputs=(
         Output("compensated_command", "V", "command that makes the stack linear", _command_scale),
-        Output("hysteresis_force", "N", "estimated hysteresis force", _force_scale),
+        Output("hysteresis_force", "N", "estimated hysteresis force", hysteresis_scale),
     ),
 )

@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from psa_casadi.display import Celled
 from psa_casadi.errors import InputError, PsaError, quoted
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ode_model import ode_model
-from psa_casadi.shown import Celled
 from psa_casadi.simulation.start import is_stack, start_state
 from psa_casadi.strict_json import json_text
 from psa_casadi.units import ComplexArray, FloatArray

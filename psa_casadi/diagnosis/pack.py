@@ -16,7 +16,6 @@ from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, sh
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import relevelled
-from psa_casadi.model.ranges import inside_ranges
 from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
@@ -93,7 +92,7 @@ class Pack:
 
     def in_character(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
         """Return whether the data ask for this effect and not for something else."""
-        return inside_ranges(fit.model.values, cause)
+        return cause.is_inside_ranges(fit.model.values)
 
     def remembers(
         self, added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment],
@@ -206,7 +205,7 @@ class StackPack(Pack):
             return False
         if tone is not None and hum and _rings_at(fit, values[tone]):
             return False
-        return inside_ranges(values, cause)
+        return cause.is_inside_ranges(values)
 
     def remembers(
         self, added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment],

@@ -13,13 +13,13 @@ from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.remedy import Size
+from psa_casadi.display import Reported, frame, made, with_units
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.split import Experiment
-from psa_casadi.shown import Reported, frame, made, with_units
 from psa_casadi.units import FloatArray
 
 Verdict = Literal[

@@ -3,9 +3,8 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
-from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import voltage_scale
-from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, shape_parameters, softplus
+from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, positive, shape_parameters, share, softplus
 from psa_casadi.variables import Parameter, State, Values
 
 #: Even exponent of the smooth clip; the larger, the sharper the corner.
@@ -98,7 +97,7 @@ def _drive_lag(s: Symbols) -> Equations:
     """Drive lag: the amplifier follows its command through a lag of second order.
 
     v_d = G v / (1 + s T + shape s^2 T^2): one pole for a shape of 0, two equal ones for 1/4, the
-    maximally flat pair for 1/2. Beside the base's R_s C_p a single pole hardly shows.
+    maximally flat pair for 1/2. A single pole hardly differs from the base's R_s C_p.
     """
     command, time = s.G * s.voltage, s.drive_lag_time + _FLOOR
     behind = s.drive_lag_voltage - command
@@ -155,8 +154,8 @@ def _amplifier_nonlinearity(s: Symbols) -> Equations:
     """Amplifier nonlinearity: the amplifier's gain changes with its output.
 
     A stack whose strain per volt changes with the voltage bends the displacement in the same way,
-    but for the hysteresis, which an amplifier bends as well. A monitor of the output voltage tells
-    them apart: the effect is looked for where there is one.
+    but for the hysteresis, which an amplifier bends as well. A monitor of the output voltage
+    separates them: the effect is looked for if there is one.
     """
     share = s.G * s.voltage / s.u_rated
     bent = s.amplifier_gain * s.u_rated * bend(share, s.amplifier_angle, s.amplifier_wave)

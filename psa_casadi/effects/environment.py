@@ -10,8 +10,8 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
-from psa_casadi.effects.parameters import positive, share
 from psa_casadi.scales import reading_scale, stroke
+from psa_casadi.shapes import positive, share
 from psa_casadi.variables import Input, Parameter, State
 
 
@@ -111,7 +111,7 @@ _ROOM = 293.15
 def _temperature(s: Symbols) -> Equations:
     """Temperature: the stack's length and its gain follow the record's temperature column.
 
-    A thermometer beside the stack leads it: stack and frame follow it through a lag, of
+    The thermometer leads the stack: stack and frame follow it through a lag, of
     milliseconds where it sits on the ceramic, of minutes where it hangs in the room.
 
     Sizes: a stack of length L moves 1.0e-3 to 1.3e-3 L at rated voltage. Poled multilayer ceramic

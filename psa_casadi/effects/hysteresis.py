@@ -2,20 +2,8 @@
 
 import casadi as ca
 
+from psa_casadi import shapes
 from psa_casadi.component import Component, Equations, Remedy, Symbols
-from psa_casadi.effects.parameters import form, positive, share
-from psa_casadi.shapes import (
-    direction,
-    magnitude_power,
-    rate_magnitude,
-    signed_power,
-    spectrum_force,
-    spectrum_parameters,
-    stop_rate,
-    stop_rates,
-    stop_state,
-    stop_states,
-)
 from psa_casadi.variables import Parameter, Values
 
 #: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
@@ -30,7 +18,7 @@ def _rate_dependent_hysteresis(s: Symbols) -> Equations:
     Two forms, of which one is tried after the other, with c - 1 = exp(rate_gain L) - 1 and L = lg
     sqrt(1 + (u'/(rate_onset u_rated))^2), the decades above the onset:
 
-    * the hysteresis force acts c-fold, at every amplitude alike;
+    * the hysteresis force acts c-fold, at every amplitude;
     * play elements' thresholds w grow c-fold (Al Janaideh): nothing is added after a reversal,
       and (c - 1) w behind the motion once the element moves, whatever the amplitude.
 
@@ -40,12 +28,12 @@ def _rate_dependent_hysteresis(s: Symbols) -> Equations:
     relative = s.voltage_rate / (s.rate_onset * s.u_rated)
     grown = ca.exp(s.rate_gain * 0.5 * ca.log10(1 + relative**2)) - 1
     width = s.rate_threshold * s.u_rated
-    at_end = magnitude_power(s.z_r / width, _ONSET)
-    same_way = 0.5 * (direction(s) + signed_power(s.z_r / width, 1.0))
+    at_end = shapes.magnitude_power(s.z_r / width, _ONSET)
+    same_way = 0.5 * (shapes.direction(s) + shapes.signed_power(s.z_r / width, 1.0))
     behind = -_SHARE * s.k_L * width * at_end * same_way
     force = s.f_H + s.rate_by_threshold * (behind - s.f_H)
     return Equations(
-        der={"z_r": stop_rate(s, s.z_r, width)},
+        der={"z_r": shapes.stop_rate(s, s.z_r, width)},
         add={"free_force": grown * force},
     )
 
@@ -67,22 +55,22 @@ RATE_DEPENDENT_HYSTERESIS = Component(
         "  z' = u' - (|u'| sgn(z) + u')/2 (|z|/w)^4,  w = rate_threshold u_rated"
     ),
     parameters=(
-        share(
+        shapes.share(
             "rate_gain", (-0.5, 0.5), "growth of the loop's width per decade of voltage rate", 0.05
         ),
-        positive(
+        shapes.positive(
             "rate_onset",
             1.0,
             "1/s",
             (1e-3, 1e3),
             "rate over rated voltage, below which the loop no longer changes",
         ),
-        positive(
+        shapes.positive(
             "rate_threshold", 0.1, "1", (0.01, 1.0), "threshold of the elements over rated voltage"
         ),
-        form("rate_by_threshold", "0: the loop grows, 1: thresholds do"),
+        shapes.form("rate_by_threshold", "0: the loop grows, 1: thresholds do"),
     ),
-    states=(stop_state("z_r", "stop element of the thresholds that grow"),),
+    states=(shapes.stop_state("z_r", "stop element of the thresholds that grow"),),
     equations=_rate_dependent_hysteresis,
     probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
     remedy=Remedy("undo_hysteresis", "slew"),
@@ -100,14 +88,14 @@ _COUNTS = (3, 3, 3)
 #: Mean weight at which it is looked for; an ordinary one is larger in narrow elements.
 _ORDINARY = 0.02
 
-_WEIGHTS = tuple(spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDINARY)))
+_WEIGHTS = tuple(shapes.spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDINARY)))
 
 
 def _hysteresis_memory(s: Symbols) -> Equations:
     """Hysteresis memory: the error depends on past reversals; minor loops nest differently."""
     first = s.memory_threshold * s.u_rated
-    elements, rates = stop_rates(s, "z_m", [ratio * first for ratio in _RATIOS])
-    total = spectrum_force(s, "memory_", elements, _COUNTS)
+    elements, rates = shapes.stop_rates(s, "z_m", [ratio * first for ratio in _RATIOS])
+    total = shapes.spectrum_force(s, "memory_", elements, _COUNTS)
     return Equations(der=rates, add={"free_force": s.k_L * s.memory_gain * total})
 
 
@@ -133,12 +121,12 @@ HYSTERESIS_MEMORY = Component(
         Parameter(
             "memory_gain", 0.0, "1", (-100.0, 100.0), "1 with the elements", scale=1.0, fitted=False
         ),
-        positive(
+        shapes.positive(
             "memory_threshold", 0.03, "1", (_NARROWEST, 1.0), "first threshold over rated voltage"
         ),
         *_WEIGHTS,
     ),
-    states=stop_states("z_m", [f"{ratio:g} times the first" for ratio in _RATIOS]),
+    states=shapes.stop_states("z_m", [f"{ratio:g} times the first" for ratio in _RATIOS]),
     equations=_hysteresis_memory,
     probe={"memory_threshold": (0.015, 0.12)},
     remedy=Remedy("undo_hysteresis", "reversal"),
@@ -150,8 +138,8 @@ HYSTERESIS_MEMORY = Component(
 
 def _rate_independent_asymmetry(s: Symbols) -> Equations:
     """Rate-independent asymmetry: the branches curve differently, equally at every frequency."""
-    bend = s.asymmetry_bend * s.u_rated * magnitude_power(s.f_H / s.h_ref, s.n)
-    return Equations(add={"hysteresis_rate": s.delta_r * (s.u + bend) * rate_magnitude(s)})
+    bend = s.asymmetry_bend * s.u_rated * shapes.magnitude_power(s.f_H / s.h_ref, s.n)
+    return Equations(add={"hysteresis_rate": s.delta_r * (s.u + bend) * shapes.rate_magnitude(s)})
 
 
 def _asymmetry_scale(p: Values) -> float:
@@ -178,7 +166,9 @@ RATE_INDEPENDENT_ASYMMETRY = Component(
             "rate-independent asymmetry",
             scale=_asymmetry_scale,
         ),
-        share("asymmetry_bend", (-100.0, 100.0), "share that follows the hysteresis force", 1.0),
+        shapes.share(
+            "asymmetry_bend", (-100.0, 100.0), "share that follows the hysteresis force", 1.0
+        ),
     ),
     equations=_rate_independent_asymmetry,
     probe={"asymmetry_bend": (-2.0, 0.0, 2.0)},

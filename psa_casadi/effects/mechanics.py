@@ -5,14 +5,16 @@ from functools import partial
 import casadi as ca
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component, Equations, Expression, Remedy, Symbols
-from psa_casadi.effects.parameters import motion, positive, share
 from psa_casadi.scales import static_stiffness, stroke, stroke_scale, velocity_scale
 from psa_casadi.shapes import (
     ANGLES,
     BEND_TEXT,
     bend,
     magnitude_power,
+    motion,
+    positive,
     shape_parameters,
+    share,
     signed_power,
     smooth_magnitude,
 )
@@ -25,8 +27,8 @@ def _structural_mode(s: Symbols) -> Equations:
     """Structural mode: a resonance of the mount or the guide that the two-mass model lacks.
 
     What drives it may run ahead of the output mass or behind it: the lead turns the phase of the
-    resonance by its arc tangent, so that a mode driven by the force ahead of its lag is told as
-    well.
+    resonance by its arc tangent, so that it also covers a mode driven by the force ahead of its
+    lag.
     """
     omega = _TWO_PI * s.mode_frequency
     return Equations(
@@ -84,12 +86,12 @@ def _load_stiffness(s: Symbols) -> Equations:
     """Load stiffness: an elastic load or guide whose stiffness changes with displacement.
 
     A linear load is no effect of its own: it stiffens k_B (or k) and, for the same stroke per volt,
-    scales k_L, so that voltage and displacement cannot tell a stack with a spring from a stiffer
-    one. Only a factor that depends on displacement shows: contacts and disc springs bow the curve,
-    flexures that stretch bend it at the end (Duffing's cubic force 20 sin(a) gain q^3 is the angle
-    a = atan(1/5)). Below the resonances a load and a bent sensor are the same curve over the
-    displacement, so that both have the same forms. A force near half of what the stack can exert
-    levels off: a load that softens would run away.
+    scales k_L, so that by voltage and displacement a stack with a spring is indistinguishable from
+    a stiffer one. Only a factor that depends on displacement shows: contacts and disc springs bow
+    the curve, flexures that stretch bend it at the end (Duffing's cubic force 20 sin(a) gain q^3 is
+    the angle a = atan(1/5)). Below the resonances a load and a bent sensor are the same curve over
+    the displacement, so that both have the same forms. A force near half of what the stack can
+    exert levels off: a load that softens would run away.
     """
     force = s.load_gain * bend(s.x / stroke(s), s.load_angle, s.load_wave)
     levelled = force / ca.sqrt(1 + (force / _MOST) ** 2)
@@ -179,7 +181,7 @@ def _backlash(s: Symbols) -> Equations:
     """Backlash: the output dwells after every reversal until a gap of fixed width is crossed.
 
     Play is the motion minus a stop: z follows the output mass until |z| = w and then rests. After a
-    reversal z moves from one end to the other and the output, at gain 1, stands still over 2 w. A
+    reversal z moves from one end to the other and the output, at gain 1, rests over 2 w. A
     guide with dry friction does the same in the displacement: it holds the output back over a fixed
     width.
     """
@@ -331,7 +333,7 @@ def _parameters(k: int) -> tuple[Parameter, ...]:
 
 
 def modal_series(count: int) -> Component:
-    """Return the component of so many modes; `series_gain` is 1 with them and 0 without."""
+    """Return the component of `count` modes; `series_gain` is 1 with them and 0 without."""
     numbers = range(1, count + 1)
     gain = Parameter("series_gain", 0.0, "1", (0.0, 2.0), "1 with the modes", fitted=False)
     return Component(

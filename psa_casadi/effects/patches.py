@@ -1,7 +1,7 @@
 """Unnamed corrections as components: generic forms with fitted weights, at a port of the stack.
 
 They are no effects and in no search: a diagnosis offers one where nothing named explains the data,
-and writes it on request. What it stands for is not known, so that nothing may be concluded from its
+and writes it on request. Its cause is not known, so that nothing may be concluded from its
 parameters; outside of the range of its records it means nothing.
 """
 

@@ -4,6 +4,7 @@ from math import pi
 
 import casadi as ca
 
+from psa_casadi import shapes
 from psa_casadi.component import (
     DISPLACEMENT_PEAKS,
     DISPLACEMENT_STEPS,
@@ -13,9 +14,7 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
-from psa_casadi.effects.parameters import motion, positive, share
 from psa_casadi.scales import reading_scale, stroke, stroke_scale
-from psa_casadi.shapes import ANGLES, BEND_TEXT, bend, pade_section, shape_parameters
 from psa_casadi.variables import Parameter, State, Values
 
 #: Smallest time constant of a section [s]; keeps it defined at zero delay.
@@ -25,8 +24,8 @@ _DELAY_FLOOR = 1e-6
 def _sensor_delay(s: Symbols) -> Equations:
     """Sensor delay: the measured displacement arrives late by a fixed time."""
     half = s.sensor_delay / 2
-    a1, b1, first = pade_section(half, _DELAY_FLOOR, s.displacement, s.z_d1, s.r_d1)
-    a2, b2, second = pade_section(half, _DELAY_FLOOR, first, s.z_d2, s.r_d2)
+    a1, b1, first = shapes.pade_section(half, _DELAY_FLOOR, s.displacement, s.z_d1, s.r_d1)
+    a2, b2, second = shapes.pade_section(half, _DELAY_FLOOR, first, s.z_d2, s.r_d2)
     return Equations(
         der={"z_d1": a1, "r_d1": b1, "z_d2": a2, "r_d2": b2},
         add={"measured_displacement": second - s.displacement},
@@ -35,8 +34,8 @@ def _sensor_delay(s: Symbols) -> Equations:
 
 def _states(index: int) -> tuple[State, State]:
     return (
-        motion(f"z_d{index}", f"filtered input of section {index}"),
-        motion(f"r_d{index}", "its rate times the section's delay"),
+        shapes.motion(f"z_d{index}", f"filtered input of section {index}"),
+        shapes.motion(f"r_d{index}", "its rate times the section's delay"),
     )
 
 
@@ -90,7 +89,7 @@ SENSOR_LAG = Component(
             "sensor_lag_time", 0.0, "s", (0.0, 0.1), "time constant of the sensor", "ms", scale=1e-4
         ),
     ),
-    states=(motion("sensor_lag_displacement", "displacement behind the lag"),),
+    states=(shapes.motion("sensor_lag_displacement", "displacement behind the lag"),),
     equations=_sensor_lag,
     remedy=Remedy("faster_sensor", "slew"),
     looks_like="phase of a first-order lag, which saturates at 90 degrees, and roll-off with it",
@@ -104,7 +103,7 @@ def _sensor_nonlinearity(s: Symbols) -> Equations:
     stack's own; what remains of a smooth curve is a bow, an S and a W.
     """
     full = stroke(s)
-    curve = bend(s.displacement / full, s.nonlinearity_angle, s.nonlinearity_wave)
+    curve = shapes.bend(s.displacement / full, s.nonlinearity_angle, s.nonlinearity_wave)
     return Equations(add={"measured_displacement": s.nonlinearity_gain * full * curve})
 
 
@@ -117,20 +116,20 @@ SENSOR_NONLINEARITY = Component(
     gain="nonlinearity_gain",
     equation_text=(
         "x_m = x + nonlinearity_gain stroke b(x/stroke),  stroke = k_L u_rated over the static"
-        " stiffness,  " + BEND_TEXT.format("nonlinearity")
+        " stiffness,  " + shapes.BEND_TEXT.format("nonlinearity")
     ),
     parameters=(
-        share(
+        shapes.share(
             "nonlinearity_gain",
             (-0.5, 0.5),
             "bow and S over the stroke, beyond the best straight line",
             0.002,
         ),
-        *shape_parameters("nonlinearity"),
+        *shapes.shape_parameters("nonlinearity"),
     ),
     equations=_sensor_nonlinearity,
     curve="displacement",
-    probe={"nonlinearity_angle": ANGLES},
+    probe={"nonlinearity_angle": shapes.ANGLES},
     remedy=Remedy("calibrate_sensor", "range"),
     looks_like="the residual is a function of the displacement alone, the same on both branches",
 )
@@ -152,7 +151,7 @@ def _sensor_ripple(s: Symbols) -> Equations:
 
 
 def _second(name: str) -> Parameter:
-    return share(
+    return shapes.share(
         f"ripple_second_{name}", (-20.0, 20.0), f"{name} of half the period, over the ripple", 0.3
     )
 
@@ -231,7 +230,7 @@ SENSOR_JUMP = Component(
         Parameter(
             "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
         ),
-        positive(
+        shapes.positive(
             "jump_width", 0.01, "1", (1e-6, 0.05), "half its rise over the stroke", limit=True
         ),
     ),

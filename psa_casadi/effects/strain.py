@@ -3,8 +3,15 @@
 import casadi as ca
 
 from psa_casadi.component import Component, Equations, Remedy, Symbols
-from psa_casadi.effects.parameters import form, motion, positive, share
-from psa_casadi.shapes import magnitude_power, rate_magnitude, smooth_magnitude
+from psa_casadi.shapes import (
+    form,
+    magnitude_power,
+    motion,
+    positive,
+    rate_magnitude,
+    share,
+    smooth_magnitude,
+)
 from psa_casadi.variables import Parameter, State, Values
 
 #: Time constants of the relaxations, as multiples of `creep_time`: a decade apart.
@@ -119,7 +126,7 @@ FIELD_DEPENDENT_CAPACITANCE = Component(
 
 
 def _saturation_of_strain(s: Symbols) -> Equations:
-    """Saturation of strain: the curve flattens at high voltage, on both branches alike."""
+    """Saturation of strain: the curve flattens at high voltage, on both branches."""
     share = 1 / ca.sqrt(1 + s.saturation_gain * (s.u / s.u_rated) ** 2) - 1
     return Equations(add={"free_force": s.k_L * s.u * share})
 

@@ -96,48 +96,51 @@ def coupled(fmus: list[Path], step: float, *, slopes: bool) -> float:
 
 
 class Slave:
-    """One co-simulation FMU in fmpy, by the names of its variables; a context manager."""
+    """One co-simulation FMU in fmpy, by the names of its variables; a context manager.
+
+    `fmu` is what fmpy calls.
+    """
 
     def __init__(self, path: Path) -> None:
         description = read_model_description(str(path))
         self._at = {v.name: v.valueReference for v in description.modelVariables}
         self._unpacked = str(extract(str(path)))
-        self._fmu = FMU2Slave(
+        self.fmu = FMU2Slave(
             guid=description.guid, unzipDirectory=self._unpacked, instanceName=path.stem,
             modelIdentifier=description.coSimulation.modelIdentifier,
         )  # fmt: skip
 
     def __enter__(self) -> "Slave":
-        self._fmu.instantiate()
-        self._fmu.setupExperiment(tolerance=1e-8)
-        self._fmu.enterInitializationMode()
-        self._fmu.exitInitializationMode()
+        self.fmu.instantiate()
+        self.fmu.setupExperiment(tolerance=1e-8)
+        self.fmu.enterInitializationMode()
+        self.fmu.exitInitializationMode()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._fmu.terminate()
-        self._fmu.freeInstance()
+        self.fmu.terminate()
+        self.fmu.freeInstance()
         shutil.rmtree(self._unpacked, ignore_errors=True)
 
     def set(self, values: dict[str, float], rates: dict[str, float] | None = None) -> None:
         """Set inputs, and their first derivatives where there are any."""
-        self._fmu.setReal([self._at[n] for n in values], list(values.values()))
+        self.fmu.setReal([self._at[n] for n in values], list(values.values()))
         if rates:
             at = [self._at[n] for n in rates]
-            self._fmu.setRealInputDerivatives(at, [1] * len(at), list(rates.values()))
+            self.fmu.setRealInputDerivatives(at, [1] * len(at), list(rates.values()))
 
     def get(self, names: Sequence[str]) -> list[float]:
         """Return the values of variables."""
-        return list(self._fmu.getReal([self._at[n] for n in names]))
+        return list(self.fmu.getReal([self._at[n] for n in names]))
 
     def rates(self, names: Sequence[str]) -> list[float]:
         """Return the first derivatives of outputs."""
         at = [self._at[n] for n in names]
-        return list(self._fmu.getRealOutputDerivatives(at, [1] * len(at)))
+        return list(self.fmu.getRealOutputDerivatives(at, [1] * len(at)))
 
     def step(self, time: float, size: float) -> None:
         """Do one communication step."""
-        self._fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
+        self.fmu.doStep(currentCommunicationPoint=time, communicationStepSize=size)
 
 
 def _pass(source: Slave, target: Slave, names: tuple[tuple[str, str], ...], slopes: bool) -> None:

@@ -1,7 +1,7 @@
 """What examples and recipes there are: their titles, sources, scripts, and how to run one.
 
 An example is a module of this package with a docstring and a function `main(folder)`, which leaves
-its files in the folder and returns what it found. A recipe is a page in `recipes/`; its code blocks
+its files in the folder and returns its figures. A recipe is a page in `recipes/`; its code blocks
 that are named after their language (```matlab run_stack.m) are scripts to take away.
 """
 
@@ -32,7 +32,7 @@ class Script:
 
 @dataclass(frozen=True)
 class Example:
-    """An example or a recipe: its name, its title in one line, its text as it is shown."""
+    """An example or a recipe: its name, its title in one line, its text."""
 
     name: str
     kind: str

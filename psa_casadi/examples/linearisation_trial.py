@@ -107,7 +107,7 @@ def _discrete(p: Values, h: float) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 #: Share of the stroke that the sensor's noise has (rms).
 NOISE = 1e-4
-#: The rms error of sensor and model that the identification is told, as a share of the stroke.
+#: The rms error of sensor and model that the identification assumes, as a share of the stroke.
 ERROR = 1e-3
 
 

@@ -44,8 +44,8 @@ def main(folder: Path) -> dict[str, str]:
     played = {n: measured(r, seed=2) for n, r in {**usual, "designed": design.record}.items()}
     after = {n: diagnose([first, r], effects=effects) for n, r in played.items()}
     _draw(folder / "separate_two_causes.png", design, played, after)
-    return {"after the first triangle": said(before)} | {
-        f"with a {n} record besides": said(d) for n, d in after.items()
+    return {"after the first triangle": named_causes(before)} | {
+        f"with a {n} record besides": named_causes(d) for n, d in after.items()
     }
 
 
@@ -58,8 +58,8 @@ def measured(record: Signals, seed: int) -> Record:
     return Record(name=record.name, time=record.time, voltage=voltage, displacement=x + noise)
 
 
-def said(d: StackDiagnosis) -> str:
-    """Return what a diagnosis names, with what cannot be distinguished from it."""
+def named_causes(d: StackDiagnosis) -> str:
+    """Return the causes of a diagnosis, with what cannot be distinguished from them."""
     names = [n for c in d.causes for n in (c.effect, *c.cannot_be_told_from)]
     return " or ".join(names) or d.verdict
 
@@ -74,7 +74,7 @@ def _draw(
     for axes, (name, record) in zip(rows, played.items(), strict=True):
         axes.plot(record.time, record.voltage, color="#0072b2", linewidth=1.2)
         grown = growth.get(name, least)
-        words = said(after[name]).replace("_", " ")
+        words = named_causes(after[name]).replace("_", " ")
         axes.set_title(
             f"{name}: ln B grows by {grown:.2g} (predicted); diagnosed: {words}", fontsize=9
         )

@@ -4,16 +4,15 @@
 bench or a controller does, stores its state, goes on, and returns to it.
 """
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fmpy import extract, read_model_description, simulate_fmu
-from fmpy.fmi2 import FMU2Slave
+from fmpy import simulate_fmu
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
+from psa_casadi.examples.co_simulation import Slave
 
 #: Duration of one triangle and the communication step [s].
 END, STEP = 4e-2, 1e-4
@@ -70,42 +69,24 @@ def _step_by_step(fmu: Path, voltage: Any) -> tuple[float, float]:
     """Drive the FMU call by call; return the last displacement [m], twice.
 
     The second time only the second half runs, from the state that was stored in the middle. Before
-    every step the FMU is told the voltage and its slope, so it knows the ramp within the step.
+    every step the FMU gets the voltage and its slope, so it knows the ramp within the step.
     """
-    description = read_model_description(str(fmu))
-    at = {v.name: v.valueReference for v in description.modelVariables}
-    unpacked = str(extract(str(fmu)))
-    slave = FMU2Slave(
-        guid=description.guid,
-        unzipDirectory=unpacked,
-        modelIdentifier=description.coSimulation.modelIdentifier,
-        instanceName="stack",
-    )
-    try:
-        slave.instantiate()
-        slave.setupExperiment(tolerance=1e-8, startTime=0.0, stopTime=END)
-        slave.enterInitializationMode()
-        slave.exitInitializationMode()
-        half = round(END / STEP / 2)
-        _drive(slave, at, voltage, range(half))
-        middle = slave.getFMUState()
-        _drive(slave, at, voltage, range(half, 2 * half))
-        first = float(slave.getReal([at["displacement"]])[0])
-        slave.setFMUState(middle)
-        _drive(slave, at, voltage, range(half, 2 * half))
-        again = float(slave.getReal([at["displacement"]])[0])
-        slave.freeFMUState(middle)
-        slave.terminate()
-        slave.freeInstance()
-    finally:
-        shutil.rmtree(unpacked, ignore_errors=True)
+    half = round(END / STEP / 2)
+    with Slave(fmu) as slave:
+        _drive(slave, voltage, range(half))
+        middle = slave.fmu.getFMUState()
+        _drive(slave, voltage, range(half, 2 * half))
+        (first,) = slave.get(["displacement"])
+        slave.fmu.setFMUState(middle)
+        _drive(slave, voltage, range(half, 2 * half))
+        (again,) = slave.get(["displacement"])
+        slave.fmu.freeFMUState(middle)
     return first, again
 
 
-def _drive(slave: FMU2Slave, at: dict[str, int], voltage: Any, steps: range) -> None:
+def _drive(slave: Slave, voltage: Any, steps: range) -> None:
     for k in steps:
         time = k * STEP
         now, then = np.interp([time, time + STEP], voltage["time"], voltage["voltage"])
-        slave.setReal([at["voltage"]], [float(now)])
-        slave.setRealInputDerivatives([at["voltage"]], [1], [float(then - now) / STEP])
-        slave.doStep(currentCommunicationPoint=time, communicationStepSize=STEP)
+        slave.set({"voltage": float(now)}, {"voltage": float(then - now) / STEP})
+        slave.step(time, STEP)

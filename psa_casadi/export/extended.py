@@ -33,7 +33,7 @@ from psa_casadi.export.ssp import (
 from psa_casadi.files import atomic_path, temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Opened, ported
-from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.start import start_for
 from psa_casadi.variables import Input, Output, State
 
 _BEFORE, _ORIGINAL, _BEHIND = "before", "original", "behind"
@@ -193,7 +193,7 @@ def _side(
     ports = [p for p in opened.ports if p.kind == kind] if isinstance(opened, Opened) else []
     made = model.with_components([ported(passing, frozenset(ports)), *effects])
     first = np.array([[i.start for i in inputs]] * 2)
-    rest = begun(made, np.array([0.0, 1.0]), first, {}).x.tolist()
+    rest = start_for(made, np.array([0.0, 1.0]), first, {}).x.tolist()
     made = made.with_starts(dict(zip(made.state_names, rest, strict=True)))
     return replace(made, name=name, description=f"effects {name} the FMU")
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from psa_casadi.display import Worded
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import (
     DETERMINED_WIDTH,
@@ -22,7 +23,6 @@ from psa_casadi.records.drive import reversals
 from psa_casadi.records.excitation import decaying_triangle, multisine, sine, time_grid
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.shown import Worded
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time
 from psa_casadi.units import FloatArray

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from psa_casadi.display import Worded
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.model.compose import Model
-from psa_casadi.shown import Worded
 from psa_casadi.variables import Values
 
 #: A combination is known if its relative standard error is below this ...

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from psa_casadi.display import made
 from psa_casadi.identification.advice import Advice, advice
 from psa_casadi.identification.combinations import Combination, free_combinations
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
@@ -47,7 +48,6 @@ from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
-from psa_casadi.shown import made
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 
 #: Rounds of fitting with every record's residual as its noise level.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.display import Reported, frame, made
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
@@ -17,7 +18,6 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.records.suspects import SPIKE
-from psa_casadi.shown import Reported, frame, made
 from psa_casadi.strict_json import json_text
 from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import Interval, Provenance

@@ -7,19 +7,12 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.component import Component, Expression
+from psa_casadi.display import Celled
 from psa_casadi.errors import InputError, quoted
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.shown import Celled
 from psa_casadi.units import FloatArray
-from psa_casadi.variables import (
-    Input,
-    Parameter,
-    Provenance,
-    Publication,
-    State,
-    nominal_value,
-)
+from psa_casadi.variables import Input, Parameter, Provenance, Publication, State, nominal_value
 
 __all__ = ["Model", "Structure", "compose"]
 
@@ -126,7 +119,8 @@ class Model(Celled):
 
     def error_sizes(self) -> FloatArray:
         """Return the size against which an error of every state counts, shape (nx,)."""
-        return np.array([nominal_value(s.errs_over, self.values) for s in self.structure.states])
+        sizes = [s.nominal if s.whole is None else s.whole for s in self.structure.states]
+        return np.array([nominal_value(size, self.values) for size in sizes])
 
     def output_nominals(self) -> FloatArray:
         """Return the usual size of every output, shape (ny,)."""
@@ -193,7 +187,7 @@ class Model(Celled):
         return replace(self, structure=s.started(starts))
 
     def with_effect(self, effect: Component, values: Mapping[str, float] | None = None) -> "Model":
-        """Return the model with one more effect, at its default gain of 0 unless given."""
+        """Return the model with one more effect, its gain 0 unless `values` has another."""
         if effect.name in (c.name for c in self.components):
             return self.with_values(values or {})
         return self.with_components((*self.components, effect)).with_values(values or {})

@@ -23,7 +23,7 @@ import casadi as ca
 from psa_casadi.component import Equations, Expression, KeptEquations, OnDemand
 from psa_casadi.errors import Problems
 from psa_casadi.model.graph import ExpressionGraph
-from psa_casadi.strict_json import shown
+from psa_casadi.strict_json import brief
 
 _ONE = "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p log10 sqrt"
 _ONE += " fabs sign floor ceil erf"
@@ -178,7 +178,7 @@ class _Reader:
         self._defined: dict[str, Expression] = {}
 
     def define(self, name: str, value: Expression) -> None:
-        """Give an expression a name; raises ValueError where it stands for another thing."""
+        """Give an expression a name; raises ValueError if it is taken."""
         if name in self.symbols or name in self._defined:
             raise ValueError("is used before it stands there, or is the name of a symbol.")
         self._defined[name] = value
@@ -196,7 +196,7 @@ class _Reader:
                 tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ValueError(
-                f"is {shown(text)}, which is no expression ({type(error).__name__}); write it as in"
+                f"is {brief(text)}, which is no expression ({type(error).__name__}); write it as in"
                 " -k*x + fmax(u, 0)."
             ) from error
         return self._read(tree, 0)
@@ -243,7 +243,7 @@ def _folded(connect: Callable[..., Expression], *expressions: Expression) -> Exp
 
 
 def _function(name: str, count: int) -> Callable[..., Expression]:
-    """Return a function of the text; raises ValueError where there is none of so many arguments."""
+    """Return a function of the text; raises ValueError if none has `count` arguments."""
     if FUNCTIONS.get(name) != count:
         known = ", ".join(f"{n} ({k})" for n, k in FUNCTIONS.items())
         raise ValueError(f"calls {name[:80]} of {count}; the functions (of how many) are {known}.")

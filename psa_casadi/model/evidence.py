@@ -5,13 +5,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-from psa_casadi.strict_json import shown
+from psa_casadi.strict_json import brief
 from psa_casadi.variables import Interval
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Error over samples that no fit has seen [m], with the 95 % interval of its rms.
+    """Error over held-out samples [m], with the 95 % interval of its rms.
 
     `nrmse_percent` is in percent of each record's range. `records` is the number of held-out
     records that the interval is taken over, 0 where it is blocks of fewer ones.
@@ -51,7 +51,7 @@ class ErrorBudget:
 
 @dataclass(frozen=True)
 class SeenRange:
-    """What the records have shown: voltage [V], its largest rate [V/s], longest duration [s].
+    """Ranges of the records: voltage [V], its largest rate [V/s], longest duration [s].
 
     `temperature` [K] is None where no record has one.
     """
@@ -82,8 +82,8 @@ class RecordRun:
 
     What the sensor shows is the model's displacement plus `offset_m`. `samples` counts those after
     blocks of `averaged` samples were averaged (1: none were). `held_out` lists stretches [first,
-    stop) of samples that no fit has seen, which have the error `held_out_m` (rms, None without
-    them); `fitted_m` is that of the others.
+    stop) of held-out samples, which have the error `held_out_m` (rms, None without them);
+    `fitted_m` is that of the others.
     """
 
     record: str
@@ -114,11 +114,11 @@ class ReferenceRun:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What stands behind the values of an identified or diagnosed model.
+    """The data behind the values of an identified or diagnosed model.
 
-    `by` is what found them. `fitted_m` is the error over the samples of the fit [m]. `outside`
-    names components of sensor and environment that the errors count with, and that an exported
-    plant leaves out. `unnamed` says which correction without a name the model holds, if any.
+    `by` is the work that determined them. `fitted_m` is the error over the samples of the fit [m].
+    `outside` names components of sensor and environment that the errors count with, and that an
+    exported plant leaves out. `unnamed` names a correction without a cause that the model holds.
     """
 
     by: str
@@ -155,11 +155,11 @@ def contradictions(e: Evidence, parameters: Mapping[str, Any]) -> Iterator[str]:
         yield "'evidence' has an error, a rate or a duration below 0."
     for name, interval in intervals.items():
         if interval is not None and interval.low > interval.high:
-            yield f"'evidence.{name}' is {shown(list(interval))}; give [low, high]."
+            yield f"'evidence.{name}' is {brief(list(interval))}; give [low, high]."
     c, rows = e.covariance, e.covariance.matrix
     unknown = [n for n in c.names if n not in parameters]
     if unknown or len(set(c.names)) < len(c.names):
-        yield f"'evidence.covariance.names' must name parameters, none twice; not {shown(unknown)}."
+        yield f"'evidence.covariance.names' must name parameters, none twice; not {brief(unknown)}."
     if [len(c.names)] * len(c.names) != [len(row) for row in rows]:
         yield "'evidence.covariance.matrix' must have a row and a column for each name."
     elif any(row[i] < 0.0 for i, row in enumerate(rows)) or rows != tuple(zip(*rows, strict=True)):
@@ -169,7 +169,7 @@ def contradictions(e: Evidence, parameters: Mapping[str, Any]) -> Iterator[str]:
 
 def _bad_runs(runs: Sequence[RecordRun], r: ReferenceRun | None) -> Iterator[str]:
     for run in runs:
-        of, ends = f"'evidence.runs' of {shown(run.record)}", [k for s in run.held_out for k in s]
+        of, ends = f"'evidence.runs' of {brief(run.record)}", [k for s in run.held_out for k in s]
         if run.averaged < 1 or run.samples < 2:
             yield f"{of} must have samples, each of at least one."
         if any(a >= b for a, b in pairwise([-1, *ends, run.samples + 1])):
@@ -179,7 +179,7 @@ def _bad_runs(runs: Sequence[RecordRun], r: ReferenceRun | None) -> Iterator[str
     if r is None:
         return
     if r.record not in [run.record for run in runs]:
-        yield f"'evidence.reference' is of {shown(r.record)}, which is not among the runs."
+        yield f"'evidence.reference' is of {brief(r.record)}, which is not among the runs."
     if len(r.time) < 2 or any(a >= b for a, b in pairwise(r.time)):
         yield "'evidence.reference.time' must have two or more increasing times."
     columns = [r.displacement, *r.inputs.values()]

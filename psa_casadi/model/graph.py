@@ -13,6 +13,7 @@ import casadi as ca
 
 from psa_casadi.component import Expression
 from psa_casadi.errors import InputError
+from psa_casadi.symbolic import instructions
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ def square(graph: "ExpressionGraph", x: int) -> int:
     return graph.add("pow", x, graph.add("constant", value=2.0))
 
 
-#: Operations of CasADi that are said in other words.
+#: Operations of CasADi that are written with others.
 PLAINLY: dict[int, Callable[..., int]] = {
     ca.OP_TWICE: lambda g, x: g.add("mul", g.add("constant", value=2.0), x),
     ca.OP_SQ: square,
@@ -47,7 +48,7 @@ PLAINLY: dict[int, Callable[..., int]] = {
 class ExpressionGraph:
     """Nodes by number; the arguments of a node have smaller numbers than the node.
 
-    A language has names for some of CasADi's operations, by their codes, and says others with
+    A language has names for some of CasADi's operations, by their codes, and writes others with
     these: `rewritten` makes them from the graph and the numbers of the arguments.
     """
 
@@ -79,15 +80,13 @@ class ExpressionGraph:
         function = ca.Function("f", [ca.vertcat(*symbols)], dense)
         registers: dict[int, int] = {}
         results: dict[int, int] = {}
-        for k in range(function.n_instructions()):
-            code = function.instruction_id(k)
-            inputs, outputs = function.instruction_input(k), function.instruction_output(k)
+        for code, inputs, outputs in instructions(function):
             if code == ca.OP_OUTPUT:
                 results[outputs[0]] = registers[inputs[0]]
             elif code == ca.OP_INPUT:
                 registers[outputs[0]] = self.add("symbol", name=names[inputs[1]])
             elif code == ca.OP_CONST:
-                value = function.instruction_constant(k)
+                value = inputs[0]
                 if not math.isfinite(value):
                     raise InputError(
                         f"An equation holds the constant {value:g}, which {self.language} cannot"

@@ -27,6 +27,7 @@ from psa_casadi.model.own_components import (
 )
 from psa_casadi.model.own_effects import declaration_hash, known_effects
 from psa_casadi.strict_json import (
+    brief,
     decode,
     json_text,
     mistakes,
@@ -34,12 +35,11 @@ from psa_casadi.strict_json import (
     part,
     plain,
     read_json,
-    shown,
 )
 from psa_casadi.variables import Interval, Parameter, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
-#: What a diagnosis may add beside the effects of the table.
+#: What a diagnosis may add to the effects of the table.
 _BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
 _STATED = tuple(f.name for f in fields(Publication))
 _ADVICE = "give a file that `psa identify` or `psa diagnose` wrote."
@@ -47,7 +47,7 @@ _ADVICE = "give a file that `psa identify` or `psa diagnose` wrote."
 
 @dataclass(frozen=True)
 class ModelParameter:
-    """A parameter's value in its unit, its 95 % interval, and whether a fit found it."""
+    """A parameter's value in its unit, its 95 % interval, and whether it is fitted."""
 
     value: float
     unit: str = ""
@@ -104,7 +104,7 @@ def dumps(model: Model) -> str:
     what it declares. Raises InputError for equations that no text can have, two components of
     one name, and numbers and texts that no file can carry.
     """
-    origin, item = model.provenance, _written(model)
+    origin, own = model.provenance, _written(model)
     parameters = {
         p.name: {
             "value": model.values[p.name],
@@ -126,7 +126,7 @@ def dumps(model: Model) -> str:
             for c in model.effects
         ],
         "parameters": parameters,
-        **({"own": plain(item)} if item else {}),
+        **({"own": plain(own)} if own else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
@@ -139,7 +139,7 @@ def dumps(model: Model) -> str:
         return json_text(content)
     except ValueError as error:
         raise InputError(
-            f"The model {shown(model.name)} cannot be saved as MODEL.json ({error}); give it finite"
+            f"The model {brief(model.name)} cannot be saved as MODEL.json ({error}); give it finite"
             " values and intervals, and plain text as name, description and notes."
         ) from error
 
@@ -147,7 +147,7 @@ def dumps(model: Model) -> str:
 def _written(model: Model) -> dict[str, OwnComponent]:
     """Return what the file has of components that are in no table and of no module, by name."""
     known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
-    about = f"The model {shown(model.name)} cannot be saved as MODEL.json:"
+    about = f"The model {brief(model.name)} cannot be saved as MODEL.json:"
     problems, result = Problems(), dict[str, OwnComponent]()
     for name, count in Counter(c.name for c in model.components).items():
         if count > 1:
@@ -158,8 +158,7 @@ def _written(model: Model) -> dict[str, OwnComponent]:
                 result[component.name] = written(component, model.values)
         refuse_large(result.values())
     except InputError as error:
-        for problem in error.problems:
-            problems.add(f"{about} {problem}")
+        problems.extend(f"{about} {problem}" for problem in error.problems)
     problems.raise_if_any()
     return result
 
@@ -167,7 +166,7 @@ def _written(model: Model) -> dict[str, OwnComponent]:
 def no_fmu(used: FmuUsed, name: str, parameters: tuple[Parameter, ...]) -> Component:
     """Refuse the FMU of a model: where this is the opener, none is run. Raises InputError."""
     raise InputError(
-        f"the model has the FMU {shown(used.file)}, which is not opened from here; type"
+        f"the model has the FMU {brief(used.file)}, which is not opened from here; type"
         " psa.load_model(MODEL, fmu=FMU)."
     )
 
@@ -188,26 +187,25 @@ def model_of(
     `opener` returns the component of an FMU that it has. Raises InputError that names every unknown
     name, missing or bad value.
     """
-    result = content.get("format") if isinstance(content, dict) else type(content).__name__
-    if not isinstance(content, dict) or result != FORMAT:
+    stated = content.get("format") if isinstance(content, dict) else type(content).__name__
+    if not isinstance(content, dict) or stated != FORMAT:
         raise InputError(
-            f"{source} is not a model file: its format is {shown(result)}, expected '{FORMAT}';"
+            f"{source} is not a model file: its format is {brief(stated)}, expected '{FORMAT}';"
             f" {_ADVICE}"
         )
     declared = part(Mapping[str, OwnComponent], content.get("own", {})) or {}
     try:
-        item = components_of(declared, opener)
+        own = components_of(declared, opener)
     except InputError as error:
         _refuse(error.problems, source)
         raise
-    table = {**COMPONENTS, **item}, {**known_effects(effects), **_BESIDE, **item}
-    _refuse(_problems(content, *table), source)
+    tables = {**COMPONENTS, **own}, {**known_effects(effects), **_BESIDE, **own}
+    _refuse(_problems(content, *tables), source)
     file = decode(ModelFile, content, source)
-    components = [table[0][name] for name in file.components]
-    components += [table[1][_name_of(effect)] for effect in file.effects]
-    inputs = file.parameters
+    components = [tables[0][name] for name in file.components]
+    components += [tables[1][_name_of(effect)] for effect in file.effects]
     try:
-        values = {name: p.value for name, p in inputs.items()}
+        values = {name: p.value for name, p in file.parameters.items()}
         model = compose(components, values, name=file.name, description=file.description)
         model = model.with_starts(file.starts)
     except InputError as error:
@@ -215,7 +213,7 @@ def model_of(
         raise
     if file.evidence is not None:
         _refuse(contradictions(file.evidence, model.values), source)
-    ordered = {p.name: inputs[p.name] for p in model.structure.parameters}
+    ordered = {p.name: file.parameters[p.name] for p in model.structure.parameters}
     provenance = Provenance(
         identified_from=tuple((r.record, r.sha256) for r in file.identified_from),
         package_version=file.package_version,
@@ -243,8 +241,7 @@ def read_content(path: str | os.PathLike[str]) -> Any:
 def _refuse(sentences: Iterable[str], source: str) -> None:
     """Raise InputError with the first 20 sentences and a count of the others, if there are any."""
     problems = Problems()
-    for sentence in sentences:
-        problems.add(f"{source}: {sentence}")
+    problems.extend(f"{source}: {sentence}" for sentence in sentences)
     problems.raise_if_any()
 
 
@@ -274,34 +271,34 @@ def _problems(
             )
     for name, count in Counter(map(_name_of, (*names, *references))).items():
         if count > 1:
-            problems.append(f"{shown(name)} is listed {count} times; list it once.")
+            problems.append(f"{brief(name)} is listed {count} times; list it once.")
     if isinstance(stated := content.get("publication"), dict):
         extra = [n for n in stated if n not in _STATED]
         problems += [
             f"'publication.{n[:80]}' is unknown; give {', '.join(_STATED)}." for n in extra
         ]
-    if isinstance(inputs := content.get("parameters"), dict):
-        problems += _parameter_problems(inputs, known)
+    if isinstance(parameters := content.get("parameters"), dict):
+        problems += _parameter_problems(parameters, known)
         declared = {p.name for c in known for p in c.parameters}
-        unknown = [n for n in inputs if n not in declared]
+        unknown = [n for n in parameters if n not in declared]
         if unknown and not problems:
             problems.append(
-                f"unknown parameters {shown(unknown)}; remove them or add their component."
+                f"unknown parameters {brief(unknown)}; remove them or add their component."
             )
     return problems
 
 
 def _listed(content: dict[str, Any], key: str) -> list[Any]:
-    return result if isinstance(result := content.get(key), list) else []
+    return value if isinstance(value := content.get(key), list) else []
 
 
 def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component]) -> str:
     if isinstance(reference, str):
         known = quoted(sorted(table))
-        return f"unknown name {shown(reference)} in {key}; the known ones are {known}."
+        return f"unknown name {brief(reference)} in {key}; the known ones are {known}."
     module = reference.module[:80]
     return (
-        f"has the effect {shown(reference.name)} of the module {module}, which was not named; give"
+        f"has the effect {brief(reference.name)} of the module {module}, which was not named; give"
         f" --effects {module} (in Python: effects=psa.own_effects({module!r}).values())."
     )
 
@@ -314,11 +311,11 @@ def _parameter_problems(table: dict[str, Any], known: Iterable[Component]) -> It
         entry = part(ModelParameter, table[parameter.name])
         if entry and entry.unit not in ("", parameter.unit):
             yield (
-                f"'{parameter.name}' is given in {shown(entry.unit)}; convert it to"
+                f"'{parameter.name}' is given in {brief(entry.unit)}; convert it to"
                 f" '{parameter.unit}'."
             )
         if entry and entry.interval and not entry.interval.low <= entry.interval.high:
             yield (
-                f"the interval of '{parameter.name}' is {shown(list(entry.interval))}; give [low,"
+                f"the interval of '{parameter.name}' is {brief(list(entry.interval))}; give [low,"
                 " high] or null."
             )

@@ -28,7 +28,7 @@ class PlantResponse:
     modes: tuple[tuple[float, float], ...]
 
     def resonance(self) -> tuple[float, float] | None:
-        """Return frequency and damping of the mode that stands out most, or None."""
+        """Return frequency and damping of the light mode with the largest response, or None."""
         weak = [m for m in self.modes if m[1] < _DAMPED]
         if not weak:
             return None
@@ -41,8 +41,8 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
     s = plant.structure
     row = plant.output_names.index(position) if position else 0
     start = [v.start for v in s.states], [v.start for v in s.inputs]
-    result = s.slopes(0.0, *start, plant.parameter_vector())
-    A, B, C, _ = (np.array(m, dtype=float) for m in result)
+    slopes = s.slopes(0.0, *start, plant.parameter_vector())
+    A, B, C, _ = (np.array(m, dtype=float) for m in slopes)
     size, n = plant.state_nominals(), len(A) + 1
     A, B, C = A * size / size[:, None], B / size[:, None], C[[row]] * size
     # the output behind a lag of first order
@@ -135,9 +135,9 @@ def controller_for(
     lag = sample_time / np.pi
     response = plant_response(plant, position, sample_time, lag)
     rest = float(response.response[0].real)
-    result = _search(response, np.sign(rest), sensitivity, resonance_tolerance)
+    gains = _search(response, np.sign(rest), sensitivity, resonance_tolerance)
     model = part_model(
-        "position_controller", **result, sample_time=sample_time, filter_time=lag,
+        "position_controller", **gains, sample_time=sample_time, filter_time=lag,
         feed_forward=1.0 / rest if feed_forward else 0.0, lowest_command=lowest_command,
         highest_command=highest_command,
     )  # fmt: skip
@@ -221,7 +221,7 @@ def _search(
     shapes = [(0.5, 0.5)]
     if mode:
         shapes += [(f, w) for f, w in product(_FLOORS, _WIDTHS) if f < w]
-    best, result = 0.0, (0.5, 0.5, 0.0)
+    best, tuned = 0.0, (0.5, 0.5, 0.0)
     for floor, width in shapes:
         others = (1.0 - tolerance, 1.0, 1.0 + tolerance) if floor != width else (1.0,)
         notches = np.array([notch_response(z, period, frequency * b, floor, width) for b in others])
@@ -230,8 +230,8 @@ def _search(
             loop = base * (ratio + 0.5 * period * (z + 1.0) / (z - 1.0))
             gain = _largest_gain(loop, 1.0 / sensitivity)
             if gain > best:
-                best, result = gain, (floor, width, ratio)
-    floor, width, ratio = result
+                best, tuned = gain, (floor, width, ratio)
+    floor, width, ratio = tuned
     return {
         "notch_frequency": frequency,
         "notch_floor": floor,

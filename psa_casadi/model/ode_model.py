@@ -10,6 +10,7 @@ import casadi as ca
 from psa_casadi.component import Balance, Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.symbolic import instructions
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
@@ -17,7 +18,7 @@ from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 SYMBOLS, EXPRESSIONS = ("t", "x", "u", "p", "w", "z"), ("ode", "y", "zero", "wdef", "alg")
 #: What else CasADi's integrators know, and why it cannot be here.
 _REFUSED = {"quad": "quadratures: make each a state, its expression a row of 'ode'"}
-#: Columns of which one says how many rows the other has, and what the rows of both are.
+#: Columns with as many rows as each other, and what the rows of both are.
 _PAIRS = (
     ("x", "ode", "state", "derivative"),
     ("w", "wdef", "intermediate", "expression"),
@@ -136,8 +137,8 @@ def _read(
     names: dict[str, list[str]] = {k: [] for k in SYMBOLS}
     for k in SYMBOLS:
         for symbol in ca.symvar(columns[k]) if k in columns else ():
-            item, count = symbol.name(), symbol.numel()
-            names[k] += [item] if count == 1 else [f"{item}_{i}" for i in range(count)]
+            name, count = symbol.name(), symbol.numel()
+            names[k] += [name] if count == 1 else [f"{name}_{i}" for i in range(count)]
     whole = {"t": kind.sym("t"), **columns}
     before, after = ([whole.get(k, kind(0, 1)) for k in q] for q in (SYMBOLS, EXPRESSIONS))
     function = _scalar(ca.Function("ode", before, after, list(SYMBOLS), list(EXPRESSIONS)))
@@ -201,10 +202,10 @@ def _check_symbols(columns: Mapping[str, Expression]) -> None:
     owners: dict[str, list[str]] = {}
     for column, symbol in symbols:
         owners.setdefault(symbol.name(), []).append(column)
-    for own_name, places in owners.items():
+    for name, places in owners.items():
         if len(places) > 1:
             problems.add(
-                f"The symbol '{own_name}' stands {len(places)} times in {' and '.join(places)};"
+                f"The symbol '{name}' stands {len(places)} times in {' and '.join(places)};"
                 " give every row a symbol and a name of its own."
             )
     known = {symbol.__hash__() for _, symbol in symbols}
@@ -237,8 +238,7 @@ def _scalar(function: ca.Function) -> ca.Function:
         expanded = function.expand("ode")
     except RuntimeError as error:
         why = str(error).splitlines()[-1].strip()
-    count = 0 if expanded is None else expanded.n_instructions()
-    if expanded is None or any(expanded.instruction_id(k) == ca.OP_CALL for k in range(count)):
+    if expanded is None or any(op == ca.OP_CALL for op, *_ in instructions(expanded)):
         raise InputError(
             "The ODE has an operation that is no elementary function of scalars (a table, a"
             f" solver, an external function): {why} Write it with elementary functions, so that it"
@@ -250,7 +250,7 @@ def _scalar(function: ca.Function) -> ca.Function:
 def _without_algebra(f: ca.Function) -> ca.Function:
     """Return f(t, x, u, p, w) with algebraic variables replaced by what their equations make them.
 
-    An intermediate that depends on them stands in these equations as what it is defined as.
+    These equations have the definition of an intermediate that depends on them.
     """
     *known, w, z = f.sx_in()
     *result, wdef, alg = f(*known, w, z)
@@ -289,7 +289,7 @@ def _declared(
     An ODE without outputs shows all of its states.
     """
     problems = Problems()
-    if not _is_identifier(name):
+    if not is_identifier(name):
         problems.add(
             f"'{name}' cannot name a model; use letters, digits, underscores, no digit first."
         )
@@ -344,7 +344,8 @@ def _variable(
     return Parameter(entry, float(values.get(entry, 0.0)), "1", (-math.inf, math.inf), about)
 
 
-def _is_identifier(name: str) -> bool:
+def is_identifier(name: str) -> bool:
+    """Whether a name is one in C and Modelica: letters, digits, underscores, no digit first."""
     return re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) is not None
 
 
@@ -354,7 +355,7 @@ def check_variable(variable: Any, values: Mapping[str, float], problems: Problem
     A usual size may be a function of parameters; those must be parameters of this model.
     """
     name = variable.name
-    if not _is_identifier(name):
+    if not is_identifier(name):
         problems.add(
             f"'{name}' cannot name a variable; use letters, digits, underscores, no digit first."
         )
@@ -364,8 +365,7 @@ def check_variable(variable: Any, values: Mapping[str, float], problems: Problem
         try:
             parse_unit(unit)
         except InputError as error:
-            for problem in error.problems:
-                problems.add(f"The unit of '{name}': {problem}")
+            problems.extend(f"The unit of '{name}': {problem}" for problem in error.problems)
     numbers = [getattr(variable, k, 0.0) for k in ("start", "value", "nominal")]
     if any(isinstance(n, float | int) and not math.isfinite(n) for n in numbers):
         problems.add(f"'{name}' has a start, value or nominal that is not finite; give numbers.")

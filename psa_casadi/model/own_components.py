@@ -116,8 +116,8 @@ def written(component: Component, values: Values) -> OwnComponent:
     except InputError as error:
         raise InputError([f"'{component.name}': {p}" for p in error.problems]) from error
     variables: dict[str, Any] = {
-        kind: tuple(_declared(item, v, values) for v in getattr(component, kind))
-        for kind, (_, item) in _KINDS.items()
+        kind: tuple(_declared(form, v, values) for v in getattr(component, kind))
+        for kind, (_, form) in _KINDS.items()
     }
     return OwnComponent(**same, **variables, ports=ports, equations=equations)
 
@@ -133,9 +133,9 @@ def _declared(kind: type[T], variable: Any, values: Values) -> T:
     return kind(**table)
 
 
-def refuse_large(item: Iterable[OwnComponent]) -> None:
+def refuse_large(components: Iterable[OwnComponent]) -> None:
     """Raise InputError where components have more together than is read from a file."""
-    every = list(item)
+    every = list(components)
     texts = [text for c in every for text in c.equations.every.values()]
     variables = sum(len(getattr(c, k)) for c in every for k in (*_KINDS, "balances", "ports"))
     counts = zip(_MOST.items(), (variables, len(texts), sum(map(len, texts))), strict=True)
@@ -147,19 +147,18 @@ def refuse_large(item: Iterable[OwnComponent]) -> None:
             )
 
 
-def components_of(item: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
+def components_of(file: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
     """Return the components that a file declares, by name.
 
     Raises InputError with a sentence for each mistake, which begins with its place in the file.
     """
-    refuse_large(item.values())
+    refuse_large(file.values())
     problems, components = Problems(), {}
-    for name, declared in item.items():
+    for name, declared in file.items():
         try:
             components[name] = _component(name, declared, opener)
         except InputError as error:
-            for problem in error.problems:
-                problems.add(problem)
+            problems.extend(error.problems)
     problems.raise_if_any()
     return components
 

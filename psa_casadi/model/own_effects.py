@@ -73,19 +73,19 @@ def _effects_of(source: ModuleType) -> Mapping[str, Component]:
     listed = getattr(source, "EFFECTS", None)
     values = listed.values() if isinstance(listed, Mapping) else listed
     every = vars(source).values() if values is None else values
-    result = dict.fromkeys(c for c in every if isinstance(c, Component) and c.gain is not None)
-    if not result:
+    effects = dict.fromkeys(c for c in every if isinstance(c, Component) and c.gain is not None)
+    if not effects:
         path = getattr(source, "__file__", None)
         raise InputError(
             f"The module '{module}'{f' ({path})' if path else ''} holds no effect: a variable that"
             " is a `Component` with a gain, or a mapping EFFECTS of them."
         )
     problems, series = Problems(), {c.name: c for c in MODAL_SERIES.values()}
-    for component in result:
+    for component in effects:
         if component.name in {**COMPONENTS, **EFFECTS, **series}:
             problems.add(f"{module}: an effect of this package is named '{component.name}' too.")
     problems.raise_if_any()
-    return {c.name: replace(c, home=module) for c in result}
+    return {c.name: replace(c, home=module) for c in effects}
 
 
 @cache
@@ -93,8 +93,8 @@ def installed_effects() -> Mapping[str, Component]:
     """Return the effects of installed packages that have the entry point; raises InputError."""
     with _installed_only():
         modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
-    result = (_beside_base(_effects_of(_imported(module))) for module in modules)
-    return {name: c for effects in result for name, c in effects.items()}
+    each = [_beside_base(_effects_of(_imported(module))) for module in modules]
+    return {name: c for effects in each for name, c in effects.items()}
 
 
 def known_effects(components: Iterable[Component] = ()) -> dict[str, Component]:

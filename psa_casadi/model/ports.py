@@ -97,8 +97,8 @@ def parameter_ports(model: Model) -> tuple[Port, ...]:
     if model.structure.foreign:
         return ()
     base = [c for c in model.components if c.gain is None]
-    items = [p for c in base for p in c.parameters if p.fitted]
-    return tuple(Port("parameter", p.name, _si(p.unit)) for p in items)
+    fitted = [p for c in base for p in c.parameters if p.fitted]
+    return tuple(Port("parameter", p.name, _si(p.unit)) for p in fitted)
 
 
 def plain(component: Component) -> Component:
@@ -179,15 +179,15 @@ def seen_by(model: Model, port: Port) -> tuple[str, ...]:
         for group in (written(c).add, written(c).der):
             for name, term in group.items():
                 terms.setdefault(name, []).append(term)
-    result, waiting = set[str](), [*terms[port.variable]]
+    inside, waiting = set[str](), [*terms[port.variable]]
     stop = {*kept, *model.state_names}
     while waiting:
-        names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - result
-        result |= names
+        names = {q.name() for q in ca.symvar(ca.SX(waiting.pop()))} - inside
+        inside |= names
         waiting += [e for n in names - stop for e in terms.get(n, ())]
-    result |= {port.variable} if port.kind == "rate" else set()
+    inside |= {port.variable} if port.kind == "rate" else set()
     order = (*model.state_names, *model.input_names, *kept)
-    return tuple(n for n in order if n in result)
+    return tuple(n for n in order if n in inside)
 
 
 @in_turn
@@ -199,18 +199,18 @@ def variables_at(model: Model, port: Port) -> tuple[str, ...]:
     """
     if port.kind not in ("rate", "intermediate"):
         return (port.variable,)
-    kept, observed = kinematics(model), seen_by(model, port)
-    of = [q for n in observed for q in kept.get(n, ())]
-    texts: list[str] = []
+    kept, read = kinematics(model), seen_by(model, port)
+    of = [q for n in read for q in kept.get(n, ())]
+    independent: list[str] = []
     rows = np.zeros((0, len(model.state_names)))
-    for n in dict.fromkeys((*(n for n in observed if n in kept), *observed, *of)):
+    for n in dict.fromkeys((*(n for n in read if n in kept), *read, *of)):
         parts = kept.get(n, {n: 1.0})
         row = [parts.get(q, 0.0) for q in model.state_names]
         more = np.vstack([rows, row])
         if not any(row) or np.linalg.matrix_rank(more) > len(rows):
-            texts.append(n)
+            independent.append(n)
             rows = more if any(row) else rows
-    return tuple(texts)
+    return tuple(independent)
 
 
 def _names(component: Component, kind: Kind) -> list[str]:
@@ -239,20 +239,20 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     """
     if isinstance(component.equations, Opened):
         ports, component = ports | {*component.equations.ports}, component.equations.component
-    sorted_ports = sorted(ports, key=lambda p: p.balance)
-    items = [p for p in sorted_ports if p.variable in _names(component, p.kind)]
-    if component.gain is not None or not items:
+    by_name = sorted(ports, key=lambda p: p.balance)
+    here = [p for p in by_name if p.variable in _names(component, p.kind)]
+    if component.gain is not None or not here:
         return component
     acts = "what acts in the place of "
     about = {"input": acts, "rate": "", "output": "what is shown of ", "parameter": acts}
     balances = [*component.balances]
-    for p in items:
+    for p in here:
         if p.kind in _BEFORE:
             before = f"{p.words} {_BEFORE[p.kind]}"
             balances.append(Balance(true_sum(p.variable), p.unit, before))
         if p.kind != "intermediate":
             balances.append(Balance(p.balance, p.unit, about[p.kind] + p.words))
-    return replace(component, equations=Opened(component, tuple(items)), balances=tuple(balances))
+    return replace(component, equations=Opened(component, tuple(here)), balances=tuple(balances))
 
 
 def unit_of(model: Model, name: str) -> str:
@@ -276,13 +276,13 @@ class Opened:
 
     def __call__(self, s: Symbols) -> Equations:
         """Return the equations in these symbols."""
-        items = [p for p in self.ports if p.kind in ("input", "parameter")]
-        replaced = {p.variable: getattr(s, p.balance) for p in items}
+        replacing = [p for p in self.ports if p.kind in ("input", "parameter")]
+        replaced = {p.variable: getattr(s, p.balance) for p in replacing}
         plain = self.component.equations(_Replaced(s, replaced))
         add: dict[str, Expression] = dict(plain.add)
         der, out = dict(plain.der), dict(plain.out)
         for p in self.ports:
-            if p in items:
+            if p in replacing:
                 add[p.balance] = getattr(s, p.variable)
             elif p.kind == "rate":
                 add[p.balance], der[p.variable] = der[p.variable], getattr(s, p.balance)

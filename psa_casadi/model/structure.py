@@ -28,10 +28,10 @@ def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> 
     for names in (symbols, outputs):
         for name in sorted({n for n in names if names.count(n) > 1}):
             problems.add(f"Two components declare '{name}'; rename one or leave one out.")
-    items = [b.name for c in components for b in c.balances]
-    for name in sorted({n for n in items if n in BALANCES or items.count(n) > 1}):
+    balances = [b.name for c in components for b in c.balances]
+    for name in sorted({n for n in balances if n in BALANCES or balances.count(n) > 1}):
         problems.add(f"The balance '{name}' is declared more than once; rename one.")
-    for name in sorted({*items, "time"}.intersection(symbols)):
+    for name in sorted({*balances, "time"}.intersection(symbols)):
         problems.add(f"A component declares '{name}', the name of a balance or of time; rename it.")
     problems.raise_if_any()
 
@@ -71,14 +71,14 @@ def check_declarations(component: Component, equations: Equations) -> None:
     derived = {"velocity"} - set(equations.out)
     outputs = {o.name for o in component.outputs} - derived
     problems = Problems()
-    for kind, declared, inputs in (
+    for kind, declared, present in (
         ("derivative of the state", {s.name for s in component.states}, set(equations.der)),
         ("equation of the output", outputs, set(equations.out)),
         ("next value of the sampled state", {s.name for s in component.sampled}, {*equations.next}),
     ):
-        for name in sorted(declared - inputs):
+        for name in sorted(declared - present):
             problems.add(f"Component '{component.name}' lacks the {kind} '{name}'; declare it.")
-        for name in sorted(inputs - declared):
+        for name in sorted(present - declared):
             problems.add(
                 f"Component '{component.name}' has the {kind} '{name}', which it does not declare;"
                 " add a term to a balance instead, or declare it."
@@ -96,7 +96,7 @@ class Structure:
     substituted (for machines).
 
     `z` are the sampled states, constant but for the instants k T of the parameter `period`, T [s];
-    there they take the value `znext`, in which `z` stands for their values before the instant
+    there they take the value `znext`, in which `z` are their values before the instant
     (`next` is the same with balances kept as symbols).
     """
 
@@ -137,7 +137,7 @@ class Structure:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, in the order of their vector: asked for in every run."""
+        """Names of the parameters, in the order of their vector; every run reads them."""
         return tuple(p.name for p in self.parameters)
 
     @cached_property
@@ -198,9 +198,7 @@ class Structure:
     @in_turn
     def g(self) -> ca.Function:
         """Casadi function `(time, x, u, p, z) -> z_next`: the sampled states after an instant."""
-        arguments = [self.time, self.x, self.u, self.p, self.z]
-        names = ["time", "x", "u", "p", "z"]
-        return ca.Function("g", arguments, [self.znext], names, ["z_next"])
+        return ca.Function("g", [self.time, self.x, self.u, self.p, self.z], [self.znext])
 
 
 @cache
@@ -244,8 +242,8 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     x = _column(table[s.name] for s in states)
     xdot = resolved(der[s.name] for s in states)
     if "displacement" in balances and "velocity" not in out:
-        displayed = full[list(sums).index("displacement")]
-        out["velocity"] = ca.jtimes(displayed, x, xdot) + ca.jacobian(displayed, table["time"])
+        moved = full[list(sums).index("displacement")]
+        out["velocity"] = ca.jtimes(moved, x, xdot) + ca.jacobian(moved, table["time"])
     return Structure(
         components=components,
         parameters=parameters,

@@ -6,7 +6,6 @@ gives one model, which simulates and exports like any other: its variables are n
 `part_variable`, its components are the parts.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,6 +15,7 @@ import casadi as ca
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.ode_model import is_identifier
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Nominal, Output, Values, nominal_value
 
@@ -70,8 +70,8 @@ def connect(
     wiring = _Wiring(parts, plan)
     components = [wiring.component(part) for part in parts]
     table = {f"{part}_{n}": v for part, model in parts.items() for n, v in model.values.items()}
-    item = {p.name: table[p.name] for c in components for p in c.parameters}
-    return compose(components, item, name=name, description=description)
+    values = {p.name: table[p.name] for c in components for p in c.parameters}
+    return compose(components, values, name=name, description=description)
 
 
 @dataclass(frozen=True)
@@ -93,26 +93,26 @@ def _plan_of(
     """Check wires and names outside, names, units and periods; return what they say."""
     problems = Problems()
     for name in (*parts, *(inputs or ()), *(outputs or ())):
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+        if not is_identifier(name):
             problems.add(
                 f"'{name}' cannot name a part or a port; use letters, digits, underscores, no digit"
                 " first."
             )
     sources: dict[Port, Port] = {}
     for start, end in wires:
-        arguments, wanted = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
-        if arguments is None or wanted is None:
+        feeding, taking = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
+        if feeding is None or taking is None:
             continue
-        (source, displayed), (target, taken) = arguments, wanted
+        (source, fed), (target, taken) = feeding, taking
         if target in sources:
             problems.add(
                 f"The input '{end}' has two sources, '{'.'.join(sources[target])}' and '{start}';"
                 " leave one out."
             )
-        one, other = parse_unit(displayed.unit), parse_unit(taken.unit)
+        one, other = parse_unit(fed.unit), parse_unit(taken.unit)
         if (one.dimension, one.ratio, one.offset) != (other.dimension, other.ratio, other.offset):
             problems.add(
-                f"The wire from '{start}' [{displayed.unit}] to '{end}' [{taken.unit}] joins"
+                f"The wire from '{start}' [{fed.unit}] to '{end}' [{taken.unit}] joins"
                 " different units; wire ports of one unit, or put a part between them."
             )
         sources[target] = source
@@ -196,13 +196,9 @@ class _Wiring:
     def _renamed(self, name: str, model: Model) -> list[Expression]:
         """Return slopes, next values, switches and outputs of a part in its own new symbols."""
         s, new = model.structure, [self.symbols["time"]]
-        item = (
-            *model.parameter_names,
-            *model.state_names,
-            *model.sampled_names,
-            *model.input_names,
-        )
-        for n in item:
+        names = [*model.parameter_names, *model.state_names, *model.sampled_names]
+        names += model.input_names
+        for n in names:
             symbol, port = ca.SX.sym(f"{name}_{n}"), (name, n)
             if n in model.input_names and port not in self.plan.inputs:
                 new.append(self.inside.setdefault(port, symbol))
@@ -213,7 +209,7 @@ class _Wiring:
             new.append(self.symbols.setdefault(outside, symbol))
         results = [s.xdot, s.znext, ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.y]
         expressions: list[Expression] = ca.substitute(
-            results, [s.time, *(s.symbols[n] for n in item)], new
+            results, [s.time, *(s.symbols[n] for n in names)], new
         )
         return expressions
 
@@ -227,8 +223,8 @@ class _Wiring:
         s = model.structure
         places = {"der": model.state_names, "next": model.sampled_names, "switches": s.switches}
         whole = self._wired(name, ca.vertcat(*self.results[name][:3]), ())
-        rows = iter([whole[k] for k in range(whole.numel())])
-        values = {k: {f"{name}_{n}": next(rows) for n in names} for k, names in places.items()}
+        elements = iter([whole[k] for k in range(whole.numel())])
+        values = {k: {f"{name}_{n}": next(elements) for n in names} for k, names in places.items()}
         table = {n: self.output((name, n), ()) for n in model.output_names}
         values["out"] = {
             plan.outputs[q]: e for n, e in table.items() if (q := (name, n)) in plan.outputs
@@ -240,9 +236,9 @@ class _Wiring:
             return Equations(
                 **{
                     kind: dict(
-                        zip(item, ca.substitute(list(item.values()), before, after), strict=True)
+                        zip(rows, ca.substitute(list(rows.values()), before, after), strict=True)
                     )
-                    for kind, item in values.items()
+                    for kind, rows in values.items()
                 }
             )
 
@@ -264,7 +260,7 @@ class _Wiring:
         if s.period is not None and plan.period is not None:
             places[s.period] = plan.period
 
-        def own(variable: Any, **size: Any) -> Any:
+        def renamed(variable: Any, **size: Any) -> Any:
             text = f"{name}: {variable.description}"
             return replace(variable, name=f"{name}_{variable.name}", description=text, **size)
 
@@ -280,12 +276,12 @@ class _Wiring:
 
         return {
             "parameters": tuple(
-                own(p, scale=None if p.scale is None else size(p.scale))
+                renamed(p, scale=None if p.scale is None else size(p.scale))
                 for p in s.parameters
                 if p.name != s.period or plan.period == f"{name}_{p.name}"
             ),
-            "states": tuple(own(v, nominal=size(v.nominal)) for v in s.states),
-            "sampled": tuple(own(v, nominal=size(v.nominal)) for v in s.sampled),
+            "states": tuple(renamed(v, nominal=size(v.nominal)) for v in s.states),
+            "sampled": tuple(renamed(v, nominal=size(v.nominal)) for v in s.sampled),
             "inputs": named(s.inputs, plan.inputs),
             "outputs": named(s.outputs, plan.outputs),
         }
@@ -300,8 +296,8 @@ class _Wiring:
             )
         if port not in self.known:
             name, variable = port
-            item = self.results[name][3][self.models[name].output_names.index(variable)]
-            self.known[port] = self._wired(name, item, (*path, port))
+            row = self.models[name].output_names.index(variable)
+            self.known[port] = self._wired(name, self.results[name][3][row], (*path, port))
         return self.known[port]
 
     def _wired(self, name: str, expression: Expression, path: tuple[Port, ...]) -> Expression:
@@ -321,8 +317,8 @@ class _Wiring:
 class _BySystem:
     """A size of a part by the system's values; `places` are its parameters' names there."""
 
-    own: Nominal
+    size: Nominal
     places: Mapping[str, str]
 
     def __call__(self, values: Values) -> float:
-        return nominal_value(self.own, {n: values[place] for n, place in self.places.items()})
+        return nominal_value(self.size, {n: values[place] for n, place in self.places.items()})

@@ -66,10 +66,10 @@ def _along(x: Expression, points: Any, values: Expression, kind: str) -> Express
     inside = ca.fmin(ca.fmax(x, at[0]), at[-1])
     pieces = []
     for k, begin in enumerate(at[:-1]):
-        result = 0.0
+        piece = 0.0
         for row in weights[:, k]:
-            result = result * (inside - begin) + ca.dot(ca.DM(row), values)
-        pieces.append(result)
+            piece = piece * (inside - begin) + ca.dot(ca.DM(row), values)
+        pieces.append(piece)
     total = pieces[0]
     for begin, piece in zip(at[1:-1], pieces[1:], strict=True):
         total = ca.if_else(inside >= begin, piece, total)

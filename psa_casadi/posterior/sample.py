@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.display import Reported, frame
 from psa_casadi.errors import Problems
 from psa_casadi.files import atomic_write, temporary_folder
 from psa_casadi.interruption import interruptible_work
@@ -25,7 +26,6 @@ from psa_casadi.posterior.task import Task, own_task_of, task_of
 from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import DISPLACEMENT
-from psa_casadi.shown import Reported, frame
 from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra
 from psa_casadi.simulation.start import is_stack
 

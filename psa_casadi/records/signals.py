@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.display import Plotted, frame, with_units
 from psa_casadi.errors import Problems
-from psa_casadi.shown import Plotted, frame, with_units
 from psa_casadi.units import BoolArray, FloatArray
 
 #: What an input does between two samples.

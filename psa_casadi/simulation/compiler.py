@@ -59,8 +59,8 @@ def compiler_command() -> list[str]:
     """
     wanted = os.environ.get("CC", "").strip()
     if not wanted:
-        result = None if platform.system() == "Windows" else shutil.which("cc")
-        return [result] if result and not _only_asks_for_tools(result) else zig_command()
+        system = None if platform.system() == "Windows" else shutil.which("cc")
+        return [system] if system and not _only_asks_for_tools(system) else zig_command()
     if shutil.which(wanted):  # a path with spaces
         return [wanted]
     try:
@@ -102,8 +102,8 @@ def vector_flags() -> tuple[str, ...]:
 
     numpy knows which of its own kernels run here.
     """
-    result = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
-    kernels = " ".join(str(k.get("current")) for f in result.values() for k in f.values())
+    known = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
+    kernels = " ".join(str(k.get("current")) for f in known.values() for k in f.values())
     wide = any(name in kernels for name in ("AVX2", "X86_V3", "AVX512", "X86_V4"))
     return ("-mavx2",) if wide else ()
 
@@ -114,8 +114,8 @@ def run_compiler(command: Sequence[str], directory: Path) -> None:
     What it makes for itself lies in the directory too, so that it goes with it. Raises OSError
     where the disk is full.
     """
-    item = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
-    environment = {**os.environ, **item, "LC_ALL": "C"}  # its messages in English
+    folders = dict.fromkeys(("TMPDIR", "TMP", "TEMP"), str(directory))
+    environment = {**os.environ, **folders, "LC_ALL": "C"}  # its messages in English
     if "ziglang" in command:
         environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(writable_room("zig")))
         environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(directory))
@@ -239,7 +239,7 @@ def _compile(
     return work / output
 
 
-#: What stands before generated C.
+#: Head of generated C.
 PRAGMAS = """\
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
@@ -248,8 +248,8 @@ PRAGMAS = """\
 #endif
 #define CASADI_SYMBOL_EXPORT
 """
-#: From so many numbers on, those of a function in C are in its caller's workspace: as variables of
-#: its own they could take more of the stack than a page, which not every thread has.
+#: From this many numbers on, those of a function in C are in its caller's workspace: as variables
+#: of its own they could take more of the stack than a page, which not every thread has.
 _MANY = 200
 #: How a library reaches a function that is in another one; see `Foreign`.
 FOREIGN = """\

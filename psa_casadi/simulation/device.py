@@ -35,8 +35,8 @@ def kernel_text(structure: Structure, output: str) -> str:
         if name in texts:
             return ""
         texts.add(name)
-        result = table.get(name) or (folder / name).read_text(encoding="utf-8")
-        return _INCLUDE.sub(lambda match: text(match[1]), result)
+        source = table.get(name) or (folder / name).read_text(encoding="utf-8")
+        return _INCLUDE.sub(lambda match: text(match[1]), source)
 
     return text("exact_kernel.cu")
 
@@ -111,9 +111,9 @@ def run_on_device(
 ) -> Iterator[tuple[Summary, FloatArray | None]]:  # fmt: skip
     """Yield the sets' summaries batch by batch, with their displacements (m, n) if `whole`.
 
-    `parts` divides the sets into batches of at most so many, `numbers` gives those of a batch: the
-    device works while those of the next are made. Raises InputError where there is no device, or
-    model and record are not for exact steps, MachineError where the device fails.
+    `parts` divides the sets into batches of at most its argument, `numbers` gives those of a batch:
+    the device works while those of the next are made. Raises InputError where there is no device,
+    or model and record are not for exact steps, MachineError where the device fails.
     """
     with _failures():
         cupy = device_module()
@@ -139,11 +139,11 @@ def run_on_device(
     for which in (*parts(batch), None):
         inputs = None if which is None else numbers(which)
         with _failures():
-            result = None
+            done = None
             if waiting is not None:
-                summary, displayed = waiting
+                summary, rows = waiting
                 kept = Summary(*cupy.asnumpy(summary))
-                result = kept, cupy.asnumpy(displayed).T if whole else None
+                done = kept, cupy.asnumpy(rows).T if whole else None
             if inputs is not None:
                 sets = inputs.p.shape[1]
                 if rooms is None:  # the first batch is the largest
@@ -158,8 +158,8 @@ def run_on_device(
                 )  # fmt: skip
                 launch = kernels.get_function("psa_exact_sets")
                 launch((-(-sets // _BLOCK),), (_BLOCK,), arguments)
-        if result is not None:
-            yield result
+        if done is not None:
+            yield done
 
 
 @contextmanager

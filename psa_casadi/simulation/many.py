@@ -61,7 +61,7 @@ def simulate_many(
     Each set replaces values of the model: one mapping a set, or one mapping of names to the values
     (m,) that they have in all sets, which takes less time and memory. `rtol` is the tolerance of a
     step over the states' usual sizes; the displacement errs by a few times that of its range. A row
-    has the same bits whatever stands beside it; it is nan from where its set cannot be simulated.
+    has the same bits whatever the other sets are; it is nan from where its set cannot be simulated.
     Models and records that exact steps do not fit run in the stepper, one after the other.
 
     `reduce` makes of each displacement (n,) [m] what is kept of it, a number or an array of one
@@ -85,7 +85,7 @@ def simulate_many(
     if device not in get_args(Device):
         raise InputError(f"There is no device {device!r}; choose one of {get_args(Device)}.")
     if device == "cuda":
-        device_module()  # told before work begins
+        device_module()  # raises before work starts
     named = REDUCTIONS.get(reduce) if isinstance(reduce, str) else None
     if isinstance(reduce, str) and named is None:
         raise InputError(
@@ -136,10 +136,10 @@ def _columns(model: Model, sets: Mapping[str, npt.ArrayLike]) -> FloatArray:
     table = {name: np.atleast_1d(np.asarray(v, dtype=np.float64)) for name, v in sets.items()}
     lengths = {len(v) for v in table.values() if v.ndim == 1}
     if len(lengths) != 1 or any(v.ndim != 1 for v in table.values()):
-        output = ", ".join(f"{name} {v.shape}" for name, v in table.items()) or "none"
+        shapes = ", ".join(f"{name} {v.shape}" for name, v in table.items()) or "none"
         raise InputError(
             f"Every parameter needs one value for each set, in arrays of one length; there are:"
-            f" {output}. A parameter that all sets share belongs into the model (`with_values`)."
+            f" {shapes}. A parameter that all sets share belongs into the model (`with_values`)."
         )
     model.with_values({name: model.values.get(name, 0.0) for name in table})  # raises
     count = lengths.pop()
@@ -175,9 +175,9 @@ def _on_cores(model: Model, task: Task, p: FloatArray, reduce: _Reduce | None) -
         return []
 
     def lanes(which: range) -> list[FloatArray]:
-        item, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
+        p_of, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
         values = run_sets(
-            task.structure, task.t, task.u, p=item, x0=x0, nominal=nominal,
+            task.structure, task.t, task.u, p=p_of, x0=x0, nominal=nominal,
             tolerance=task.tolerance, output=task.output,
         )  # fmt: skip
         return kept(values.T, which)

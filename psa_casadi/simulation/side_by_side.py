@@ -7,15 +7,15 @@ lose little to each other.
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from contextvars import Context, ContextVar, copy_context
+from contextlib import AbstractContextManager, contextmanager, suppress
+from contextvars import ContextVar, copy_context
 from functools import partial
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
 from psa_casadi.errors import MachineError, PsaError
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.interruption import interruptible_work, set_within
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import why_not
 from psa_casadi.simulation.simulate import output_of
@@ -31,8 +31,8 @@ Result = TypeVar("Result")
 def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
     """Return the results for all items in their order; the first exception ends it.
 
-    What has begun is finished first, what has not is left out. Context variables are the caller's.
-    A keyboard interrupt ends the simulations of what has begun, too.
+    Work that has started is finished first, other work is left out. Context variables are the
+    caller's. A keyboard interrupt ends the simulations of work that has started, too.
     """
     inputs, count = list(items), threads()
     if len(inputs) < 2 or count == 1:
@@ -46,14 +46,9 @@ def side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[
             raise
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Give what runs inside one thread, as where other work fills the cores."""
-    token = _ALONE.set(True)
-    try:
-        yield
-    finally:
-        _ALONE.reset(token)
+def one_thread() -> AbstractContextManager[bool]:
+    """Give work in the block one thread, for use where other work fills the cores."""
+    return set_within(_ALONE, True)
 
 
 def threads() -> int:
@@ -75,10 +70,10 @@ def one_thread_of_algebra() -> Iterator[None]:
 def compiled_ahead(
     models: Iterable[Model], first: Iterable[Callable[[], object]] = ()
 ) -> Iterator[None]:
-    """Compile models beside what runs inside, after the work that comes `first` (see `compiled`).
+    """Compile models while the block runs, after the work that comes `first` (see `compiled`).
 
-    At the end, what has begun is finished and the rest is left out. What fails is tried again by
-    whoever needs it, and fails there.
+    At the end, compilations that have started finish and the rest is left out. What fails is tried
+    again by whoever needs it, and fails there.
     """
     count = threads()
     if count == 1:
@@ -87,15 +82,11 @@ def compiled_ahead(
     works: list[Callable[[], object]] = [*first, *(partial(_compile, m) for m in models)]
     with ThreadPoolExecutor(count - 1) as pool:
         for work in works:
-            pool.submit(_in_context(copy_context(), work))
+            pool.submit(copy_context().run, work)
         try:
             yield
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _in_context(context: Context, work: Callable[[], object]) -> Callable[[], object]:
-    return lambda: context.run(work)
 
 
 def compiled(models: Iterable[Model]) -> None:

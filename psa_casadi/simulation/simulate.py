@@ -1,4 +1,4 @@
-"""Simulate a model on a record's voltage, or on any voltage given as samples."""
+"""Simulate a model on a record's voltage, or on the samples of any voltage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.display import Lined, Plotted, frame, with_units
 from psa_casadi.errors import InputError, Problems, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.shown import Shown, frame, with_units
 from psa_casadi.simulation.exact.run import NotExact, run_exact
 from psa_casadi.simulation.start import start_on, start_state
 from psa_casadi.simulation.stepper import Steps, run
@@ -21,11 +21,11 @@ from psa_casadi.units import FloatArray
 SHOWN = ("measured_displacement", "displacement")
 #: Names of the two ways in results.
 EXACT, STEPPER = "exact steps", "stepper"
-#: The stepper's tolerance of a step over the one asked of the whole run: with the 0.003 of the
-#: FMU (`fmu_src/instance.c`) clipped voltages and light resonances erred by 3 times what was asked.
+#: The stepper's tolerance of a step over that of the whole run: with the 0.003 of the FMU
+#: (`fmu_src/instance.c`) clipped voltages and light resonances erred by 3 times the latter.
 STEP_SHARE, SMALLEST_STEP_RTOL = 0.0005, 1e-12
-#: Exact steps for `accurate`: tolerance of a step over the one asked, least halvings of a sample.
-#: Each is judged by the one before; a turn that one halving misses as well is seen after two.
+#: Exact steps for `accurate`: tolerance of a step over that of the run, least halvings of a sample.
+#: Each is judged by the one before; a turn that one halving misses as well shows after two.
 LADDER = ((0.03, 0), (0.01, 2), (3e-3, 4), (3e-3, 6))
 #: Share of the tolerance to which two runs agree: the finer one may err by a part of it that both
 #: have in common.
@@ -58,11 +58,12 @@ class Way:
 
 @dataclass(frozen=True)
 class Traced:
-    """Outputs (n, m), their derivatives (n, m, k), and the way that was taken."""
+    """Outputs (n, m), their derivatives (n, m, k), the way, and all states (n, nx) if asked for."""
 
     y: FloatArray
     sensitivity: FloatArray
     way: str
+    x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def output_of(model: Model) -> str | None:
@@ -83,19 +84,20 @@ def trace(
     hold: str = "linear",
     steps_limit: int = 0,
     steps_most: int = 0,
+    everything: bool = False,
 ) -> Traced:
     """Return outputs of a run and their derivatives by `unknowns`, with `s0` and `hold` of `run`.
 
-    `steps_limit` bounds the stepper's work between two samples, `steps_most` that of the run.
-    Raises SimulationError where both ways fail.
+    `everything` asks for all states. `steps_limit` bounds the stepper's work between two samples,
+    `steps_most` that of the run. Raises SimulationError where both ways fail.
     """
     if not way.stepped:
         try:
             exact_steps = run_exact(
                 model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
-                hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
+                hold=hold, unknowns=unknowns, s0=s0, outputs=outputs, everything=everything,
             )  # fmt: skip
-            return Traced(exact_steps.shown, exact_steps.sensitivity, EXACT)
+            return Traced(exact_steps.requested, exact_steps.sensitivity, EXACT, exact_steps.x)
         except NotExact:
             pass
     steps = run(
@@ -103,7 +105,7 @@ def trace(
         steps_most=steps_most, unknowns=unknowns, s0=s0, outputs=outputs,
     )  # fmt: skip
     rows = [model.output_names.index(n) for n in outputs]
-    return Traced(steps.y[:, rows], steps.sensitivity, STEPPER)
+    return Traced(steps.y[:, rows], steps.sensitivity, STEPPER, steps.x)
 
 
 def accurate(
@@ -126,21 +128,21 @@ def accurate(
             break
         if before is not None and not exact_steps.forced:
             nominal = model.output_nominals()[model.output_names.index(output)]
-            size = max(float(np.ptp(exact_steps.shown)), STILL * nominal)
-            if np.max(np.abs(exact_steps.shown - before)) <= AGREE * rtol * size:
+            size = max(float(np.ptp(exact_steps.requested)), STILL * nominal)
+            if np.max(np.abs(exact_steps.requested - before)) <= AGREE * rtol * size:
                 z = np.empty((len(t), 0))
                 cost = exact_steps.steps, exact_steps.rejected, 0
                 return Steps(exact_steps.x, z, exact_steps.y, exact_steps.sensitivity, *cost), EXACT
-        before = exact_steps.shown
+        before = exact_steps.requested
     step_rtol = max(STEP_SHARE * rtol, SMALLEST_STEP_RTOL)
     return run(model, t, u, x0, rtol=step_rtol, hold=hold), STEPPER
 
 
 @dataclass(frozen=True, repr=False)
-class Trajectory(Shown):
+class Trajectory(Plotted, Lined):
     """A simulated experiment in SI units; arrays of shape (n,), one per state and output.
 
-    `way` tells how it was integrated, by exact steps of the linear part or by the stepper; `units`
+    `way` is how it was integrated, by exact steps of the linear part or by the stepper; `units`
     are those of states and outputs.
     """
 
@@ -183,15 +185,15 @@ def simulate(
 ) -> Trajectory:
     """Simulate a model over samples of voltage [V] at strictly increasing times [s].
 
-    `load_force` [N] and `temperature` [K] are samples of further inputs, each constant at its start
-    value where not given. Between samples the voltage is linear (`hold="linear"`) or constant
+    `load_force` [N] and `temperature` [K] are samples of further inputs, each by default constant
+    at its start value. Between samples the voltage is linear (`hold="linear"`) or constant
     (`hold="zero"`). The displacement errs by at most `rtol` of its range.
 
     The model starts in the state that the first voltage and its rate imply, with `memory`
     deviations (see `start_state`). With `as_exported` it starts at its start values instead, as an
-    FMU or a Modelica package of it does; a model that has start values of its own (`settled_at`,
-    MODEL.json) does so unless a memory is given or `as_exported` is False. With `from_rest_at_zero`
-    every state starts at 0. Sampled states always start at their start values.
+    FMU or a Modelica package of it does; a model with start values that differ from its components'
+    (`settled_at`, MODEL.json) does so unless `memory` is given or `as_exported` is False. With
+    `from_rest_at_zero` every state starts at 0. Sampled states always start at their start values.
 
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
     """
@@ -223,7 +225,7 @@ def simulate(
 
 
 def input_samples(model: Model, n: int, values: Mapping[str, FloatArray]) -> FloatArray:
-    """Return the samples (n, nu) of a model's inputs; those not given stay at their start value."""
+    """Return the samples (n, nu) of a model's inputs; others stay at their start value."""
     u = np.tile([i.start for i in model.structure.inputs], (n, 1))
     for name, samples in values.items():
         u[:, model.input_names.index(name)] = samples[:n]

@@ -12,12 +12,12 @@ from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import Steps, run
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 
-#: Steps between two samples, and mean ones of a record, beyond which a model is given up.
+#: Steps between two samples, and mean ones of a record, beyond which a run is abandoned.
 _STEPS, _MEAN_STEPS = 3000, 200
 
 
@@ -28,7 +28,7 @@ def states_of(model: Model, e: Experiment, start: Mapping[str, float], rtol: flo
 
 def _course(model: Model, e: Experiment, start: Mapping[str, float], rtol: float) -> Steps:
     t, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
-    x0 = begun(model, t, u, start).x
+    x0 = start_for(model, t, u, start).x
     return run(
         model, t, u, x0, rtol=rtol, hold=e.record.hold,
         steps_limit=_STEPS, steps_most=_MEAN_STEPS * e.record.n,
@@ -59,18 +59,17 @@ def sizes_of(
     starts: Sequence[Mapping[str, float]] | None = None,
 ) -> Sizes:
     """Return the sizes of a model's signals in experiments. Raises PsaError."""
-    arguments = starts or [{} for _ in experiments]
-    pairs = zip(experiments, arguments, strict=True)
+    pairs = zip(experiments, starts or [{} for _ in experiments], strict=True)
     courses = [_course(model, e, s, _LOOK_RTOL) for e, s in pairs]
-    tables, outputs = [c.x for c in courses], [c.y for c in courses]
+    states, outputs = [c.x for c in courses], [c.y for c in courses]
     inputs = [record_inputs(model, e.record, e.record.n) for e in experiments]
     f, p = _rates(model.structure), model.parameter_vector()
-    items = []
-    for e, u, x in zip(experiments, inputs, tables, strict=True):
+    courses_of_rates = []
+    for e, u, x in zip(experiments, inputs, states, strict=True):
         time = e.record.time - e.record.time[0]
-        items.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
+        courses_of_rates.append(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x))))
     rates, sums, changes = (
-        [np.array(part).T for part in parts] for parts in zip(*items, strict=True)
+        [np.array(part).T for part in parts] for parts in zip(*courses_of_rates, strict=True)
     )
 
     def largest(names: Sequence[str], parts: Sequence[FloatArray]) -> dict[str, float]:
@@ -80,7 +79,7 @@ def sizes_of(
     return Sizes(
         signals={
             **largest(model.input_names, inputs),
-            **largest(model.state_names, tables),
+            **largest(model.state_names, states),
             **largest(model.output_names, outputs),
             **largest(_sums(model.structure), sums),
         },
@@ -101,11 +100,11 @@ def sized(model: Model, experiments: Sequence[Experiment]) -> Model:
     if not any(s.nominal == 1.0 for c in model.components for s in c.states):
         return model
     try:
-        result = sizes_of(model, experiments)
+        sizes = sizes_of(model, experiments)
     except PsaError:
         return model
     return model.with_components(
-        resized(c, tuple(result.signals[s.name] for s in c.states)) for c in model.components
+        resized(c, tuple(sizes.signals[s.name] for s in c.states)) for c in model.components
     )
 
 

@@ -1,7 +1,7 @@
 """The state at the start of a record: at rest, or in steady motion, with an unknown memory.
 
 All states without memory start where the voltage and its rate put them; memories start at their
-rest value plus a deviation that is 0 unless it is estimated or given.
+rest value plus a deviation, 0 by default or estimated.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +33,7 @@ class Start:
 
 
 def memory_names(structure: Structure) -> tuple[str, ...]:
-    """Names of the states whose start a record does not tell."""
+    """Names of the states whose start a record does not determine."""
     return tuple(s.name for s in structure.states if s.memory)
 
 
@@ -54,7 +54,7 @@ def start_on(
     """Return the initial state for samples u (n, nu) at times t (n,) [s].
 
     The first inputs and the rates at which they begin put the model there (`start_state`). An
-    imported FMU begins at its start values.
+    imported FMU starts at its start values.
     """
     if model.structure.foreign:
         x = np.array([s.start for s in model.structure.states])
@@ -64,10 +64,10 @@ def start_on(
     return start_state(model, list(u[0]), rates, memory, float(t[0]))
 
 
-def begun(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]) -> Start:
+def start_for(model: Model, t: FloatArray, u: FloatArray, deviations: Mapping[str, float]) -> Start:
     """Return the start for samples u (n, nu) at times t (n,) [s], and deviations of some states.
 
-    A stack begins where the first inputs and their rates put it (`start_on`); any other model at
+    A stack starts where the first inputs and their rates put it (`start_on`); any other model at
     its declared starts, but for the filters of effects, which begin where they would rest.
     """
     names = model.state_names
@@ -126,9 +126,9 @@ def _declared(model: Model, inputs: FloatArray, deviations: Mapping[str, float])
     if not np.isfinite(x).all():
         raise PsaError("The effects' states have no rest at the start; change the values.")
     others = [k for k in range(nx) if k not in resting]
-    item = np.linalg.pinv(slopes[:, resting])
-    by_p[resting] = -item @ by_parameter
-    by_x[np.ix_(resting, others)] = -item @ slopes[:, others]
+    inverse = np.linalg.pinv(slopes[:, resting])
+    by_p[resting] = -inverse @ by_parameter
+    by_x[np.ix_(resting, others)] = -inverse @ slopes[:, others]
     by_x[np.ix_(resting, resting)] = np.eye(len(resting))
     x[resting] += away[resting]
     return Start(x, by_p, by_x)
@@ -319,13 +319,13 @@ def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca
     rate = ca.SX.sym("rate", len(s.inputs))
     moving: Expression = start
     jacobian, by_input = _at(s, by_x, start), _at(s, by_u, start)
-    item = jacobian[fast, fast]
+    of_fast = jacobian[fast, fast]
     for _ in range(2):
         drive = by_input[fast, :] @ rate
         if memory:
             drive += jacobian[fast, memory] @ _at(s, slopes, moving)[memory]
         # a steady motion lags behind the rest by the rates it takes
-        moving = _moved(start, fast, _solved(item, -_solved(item, drive)))
+        moving = _moved(start, fast, _solved(of_fast, -_solved(of_fast, drive)))
     derivatives: list[Expression] = [ca.jacobian(moving, s.p), ca.jacobian(moving, deviation)]
     results = [ca.densify(e) for e in (moving, *derivatives)]
     return settle, rest, ca.Function("moving", [*where, known, rate], results)
@@ -336,7 +336,7 @@ def _start_functions(structure: Structure) -> tuple[ca.Function, ca.Function, ca
 def _functions_of_many(
     structure: Structure, sets: int
 ) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return the functions of `start_state` for so many columns, the last without derivatives."""
+    """Return the functions of `start_state` for `sets` columns, the last without derivatives."""
     settle, rest, moving = _start_functions(structure)
     inputs = moving.sx_in()
     start = ca.Function("start", inputs, [moving.call(inputs)[0]])

@@ -24,10 +24,10 @@ from psa_casadi.units import FloatArray
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
 _STAGES = 6
-#: As in instants.c: further from 0 a double does not tell the sample instants apart.
+#: As in instants.c: further from 0 a double does not separate the sample instants.
 _MOST_PERIODS = 1e13
 _POINTER = ctypes.c_void_p
-#: A step takes so many times as long as an exact one.
+#: A step takes this many times as long as an exact one.
 _DEARER = 4
 #: Status of a run that an interrupt has ended.
 _STOPPED = 4
@@ -132,12 +132,12 @@ def run(
     """
     s, n, nx, count = model.structure, len(t), len(model.state_names), len(unknowns)
     if s.played is not None:
-        found_so: Steps = s.played.run(
+        played: Steps = s.played.run(
             model, t, u, x0, rtol=rtol, hold=hold, unknowns=unknowns, s0=s0, outputs=outputs,
             values=values,
         )  # fmt: skip
-        return found_so
-    item = values or model.values
+        return played
+    values = values or model.values
     if z0 is None:
         z0 = np.array([q.start for q in s.sampled])
     if s0 is None:
@@ -146,7 +146,7 @@ def run(
     rows = [model.output_names.index(name) for name in requested]
     arrays: dict[str, npt.NDArray[Any]] = {
         "t": doubles(t), "u": doubles(u), "x0": doubles(x0), "z0": doubles(z0), "s0": doubles(s0),
-        "p": np.array([item[name] for name in model.parameter_names]),
+        "p": np.array([values[name] for name in model.parameter_names]),
         "nominal": model.state_nominals() if nx else np.ones(1), "x": np.empty((n, max(1, nx))),
         "z": np.empty((n, len(s.sampled))), "y": np.empty((n, len(s.outputs))),
         "which": which_of(model, unknowns), "outputs": np.array(rows, np.int32),
@@ -176,8 +176,8 @@ def run(
             f" {_REASONS[status]}. Parameter values far from physical ones are the likely cause;"
             " check them, or loosen the tolerance."
         )
-    result = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"]
-    return Steps(*result, request.steps, request.rejected, request.evaluations)
+    results = arrays["x"][:, :nx], arrays["z"], arrays["y"], arrays["dy"]
+    return Steps(*results, request.steps, request.rejected, request.evaluations)
 
 
 def doubles(values: npt.ArrayLike) -> FloatArray:

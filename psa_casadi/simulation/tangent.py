@@ -1,6 +1,6 @@
 """What one more effect adds to a model's outputs, along the model's own trajectory.
 
-An effect with the gain g and own states z, at the balances b of a model x' = f(x), y = h(x),
+An effect with the gain g and the states z, at the balances b of a model x' = f(x), y = h(x),
 
     x' = f(x) + sum_b f_b T_b(x, z),    z' = A z + r(x),    T_b = 0 at g = 0
 
@@ -23,19 +23,18 @@ import scipy
 from psa_casadi.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.simulation.exact.run import NotExact, run_exact, time_steps
+from psa_casadi.simulation.exact.run import time_steps
 from psa_casadi.simulation.exact.split import closure, dependence, split_of
-from psa_casadi.simulation.simulate import LOOSEST, Way, trace
-from psa_casadi.simulation.start import begun
-from psa_casadi.simulation.stepper import run
-from psa_casadi.symbolic import in_turn
+from psa_casadi.simulation.simulate import Way, trace
+from psa_casadi.simulation.start import start_for
+from psa_casadi.symbolic import in_turn, instructions
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Input, Parameter
 
 _GAIN, _INPUT = "tangent_gain", "tangent_"
 
-#: Rates of r at a sample count up to so many times what it moves by from one sample to the next,
-#: there or beside: beyond is a jump, which the samples do not show.
+#: Rates of r at a sample count up to this many times its change from one sample to the next, there
+#: or at a neighbour: beyond is a jump, which the samples do not show.
 _STEEPEST = 2.0
 _SAME = (
     "sqrt", "exp", "log", "fabs", "fmin", "fmax", "fmod", "sin", "cos", "tan", "sinh", "cosh",
@@ -65,16 +64,9 @@ class Along:
         f = ca.Function("f", list(arguments), ca.cse([ca.densify(ca.vec(ca.SX(expression)))]))
         self.size = f.numel_out(0)
         self._steps: list[tuple[Any, Any, Any]] = []
-        for k in range(f.n_instructions()):
-            op, inputs, kept = (
-                f.instruction_id(k), f.instruction_input(k), f.instruction_output(k)
-            )  # fmt: skip
-            if op == ca.OP_CONST:
-                self._steps.append((None, f.instruction_constant(k), kept[0]))
-            elif op == ca.OP_INPUT:
-                self._steps.append((op, inputs, kept[0]))
-            elif op == ca.OP_OUTPUT:
-                self._steps.append((op, inputs[0], kept[1]))
+        for op, inputs, kept in instructions(f):
+            if op in (ca.OP_CONST, ca.OP_INPUT, ca.OP_OUTPUT):
+                self._steps.append((op, inputs, kept[-1]))
             else:
                 self._steps.append((_OPERATIONS[op], inputs, kept[0]))
 
@@ -82,14 +74,14 @@ class Along:
         """Return the values (n, size); arguments (elements, n), or (elements,) where constant."""
         slots: dict[int, Any] = {}
         values = np.empty((n, self.size))
-        with np.errstate(all="ignore"):  # what is not finite is seen by whoever asked
+        with np.errstate(all="ignore"):  # the caller checks that all is finite
             for op, inputs, kept in self._steps:
-                if op is None:
-                    slots[kept] = inputs
+                if op == ca.OP_CONST:
+                    slots[kept] = inputs[0]
                 elif op == ca.OP_INPUT:
                     slots[kept] = arguments[inputs[0]][inputs[1]]
                 elif op == ca.OP_OUTPUT:
-                    values[:, kept] = slots[inputs]
+                    values[:, kept] = slots[inputs[0]]
                 else:
                     slots[kept] = op(*(slots[a] for a in inputs))
         return values
@@ -97,16 +89,16 @@ class Along:
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """An effect as it is looked for beside a model: what it adds, as functions of (t, x, u, p).
+    """An effect that is looked for in a model: what it adds, as functions of (t, x, u, p).
 
     `slopes` returns A (nz, nz), `rest` r (nz,); `added` the terms (balances,), `by_gain` their
     derivatives by the parameters `moved`. One that reaches no state of the model has the outputs
-    (ny,) in their place, and no `balances`. `forward` says that it reads nothing that it moves.
+    (ny,) in their place, and no `balances`. `forward`: it reads nothing that it moves.
     """
 
     structure: Structure
     moved: tuple[str, ...]
-    own: tuple[int, ...]
+    states: tuple[int, ...]
     balances: tuple[str, ...]
     forward: bool
     slopes: Along
@@ -121,7 +113,7 @@ class Law:
 def law_of(structure: Structure, effect: Component) -> Law | None:
     """Return the law of an effect of a composed model; None of one that must be simulated in full.
 
-    Those are the effects whose own states are not linear in themselves with constant coefficients,
+    Those are the effects whose states are not linear in themselves with constant coefficients,
     that are sampled, jump or call an FMU, and those at whose balances no input leaves the model its
     exact steps.
     """
@@ -130,11 +122,11 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
         return None
     written = effect.equations(Symbols(s.symbols))
     balances, terms = tuple(written.add), ca.vertcat(ca.SX(0, 1), *written.add.values())
-    item = tuple(names.index(q.name) for q in effect.states)
-    others = [k for k in range(len(names)) if k not in item]
+    states = tuple(names.index(q.name) for q in effect.states)
+    others = [k for k in range(len(names)) if k not in states]
     moved = effect.linear or (effect.gain,)
     by = ca.vertcat(*(s.symbols[n] for n in moved))
-    z, rates = s.x[list(item), 0], s.xdot[list(item), 0]
+    z, rates = s.x[list(states), 0], s.xdot[list(states), 0]
     slopes = s.jacobian(rates, z)
     if written.switches or ca.depends_on(slopes, ca.vertcat(s.x, s.u, s.time)):
         return None
@@ -149,7 +141,7 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
     forward = not ca.depends_on(ca.vertcat(rates, added), s.x[behind])
     if not reached:
         balances, added, by_gain = (), s.y, s.jacobian(s.y, by)
-    rest = ca.substitute([rates], [z], [ca.SX.zeros(len(item))])[0]
+    rest = ca.substitute([rates], [z], [ca.SX.zeros(len(states))])[0]
     ramp = ca.SX.sym("ramp", s.u.shape[0])
     every, moves = ca.vertcat(s.time, s.x, s.u), ca.vertcat(1, s.xdot, ramp)
     functions = (slopes, rest, ca.jtimes(rest, every, moves), added, by_gain)
@@ -157,7 +149,7 @@ def law_of(structure: Structure, effect: Component) -> Law | None:
         made = [Along([*s.arguments, ramp], e) for e in functions]
     except KeyError:
         return None
-    return Law(s, moved, item, balances, forward, *made)
+    return Law(s, moved, states, balances, forward, *made)
 
 
 def _stays_exact(structure: Structure, effect: Component, balances: tuple[str, ...]) -> bool:
@@ -202,21 +194,13 @@ def course_of(
     model: Model, t: FloatArray, u: FloatArray, start: Mapping[str, float], *, way: Way, hold: str,
     outputs: Sequence[str],
 ) -> Course:  # fmt: skip
-    """Return a model's course over times t (n,) [s] and inputs u (n, nu); `start` as in `begun`.
+    """Return a model's course over times t (n,) [s], inputs u (n, nu); `start` as in `start_for`.
 
     Raises SimulationError.
     """
-    x0 = begun(model, t, u, start).x
-    if not way.stepped:
-        try:
-            exact_steps = run_exact(
-                model, t, u, x0, tolerance=min(way.rtol, LOOSEST), coarsest=way.halved,
-                hold=hold, outputs=tuple(outputs), everything=True,
-            )  # fmt: skip
-            return Course(t, u, exact_steps.x, hold)
-        except NotExact:
-            pass
-    return Course(t, u, run(model, t, u, x0, rtol=way.step_rtol, hold=hold).x, hold)
+    x0 = start_for(model, t, u, start).x
+    x = trace(model, t, u, x0, way=way, outputs=outputs, hold=hold, everything=True).x
+    return Course(t, u, x, hold)
 
 
 def opened(model: Model, laws: Iterable[Law]) -> Model:
@@ -258,42 +242,42 @@ def answer(
 
     That is their derivatives by what the law moves, or, of a `finite` gain, the outputs. `effect`
     is the model with the effect, at its values, `u` (n, inputs) are the samples of its inputs,
-    `start` deviations as in `begun`. Raises NotExact where the times are too uneven for the
+    `start` deviations as in `start_for`. Raises NotExact where the times are too uneven for the
     effect's states, and SimulationError.
     """
     t, names = course.t, effect.state_names
-    others = [k for k in range(len(names)) if k not in law.own]
+    others = [k for k in range(len(names)) if k not in law.states]
     x = np.zeros((len(names), len(t)))
     x[others] = course.x.T
-    begin = begun(effect, t, u, start) if law.own else None
-    z0, p = begin.x[list(law.own)] if begin else np.zeros(0), effect.parameter_vector()
-    result = _terms(law, t, x, u.T, p, z0, finite=finite)
+    begin = start_for(effect, t, u, start) if law.states else None
+    z0, p = begin.x[list(law.states)] if begin else np.zeros(0), effect.parameter_vector()
+    terms = _terms(law, t, x, u.T, p, z0, finite=finite)
     if not law.balances:
         rows = [effect.output_names.index(name) for name in outputs]
-        return Answer(result[:, :, rows].transpose(0, 2, 1), 0.0)
-    misfit = 0.25 * _size(0.5 * (result[:-2:2] + result[2::2]) - result[1:-1:2])
-    if law.own:
+        return Answer(terms[:, :, rows].transpose(0, 2, 1), 0.0)
+    misfit = 0.25 * _size(0.5 * (terms[:-2:2] + terms[2::2]) - terms[1:-1:2])
+    if law.states:
         half = _terms(law, t[::2], x[:, ::2], u[::2].T, p, z0, finite=finite)
-        misfit = max(misfit, _size(result[::2] - half))
+        misfit = max(misfit, _size(terms[::2] - half))
     places = [model.input_names.index(_INPUT + b) for b in law.balances]
     answers = []
-    for k, terms in enumerate(result.transpose(1, 0, 2)):
+    for k, columns in enumerate(terms.transpose(1, 0, 2)):
         inputs = np.zeros((len(t), len(model.input_names)))
         inputs[:, : course.u.shape[1]] = course.u
-        inputs[:, places] = terms
+        inputs[:, places] = columns
         run_with = model.with_values({_GAIN: float(finite)})
         if begin:
             x0, slopes, gain = begin.x[others], begin.by_parameter[others], law.moved[k]
             s0 = slopes[:, [effect.parameter_names.index(gain)]]
         else:
-            first = begun(run_with, t, inputs, start)
+            first = start_for(run_with, t, inputs, start)
             x0, s0 = first.x, first.by_parameter[:, [model.parameter_names.index(_GAIN)]]
         traced = trace(
             run_with, t, inputs, x0, way=way, outputs=outputs, hold=course.hold,
             unknowns=() if finite else (_GAIN,), s0=None if finite else s0,
         )  # fmt: skip
         answers.append(traced.y if finite else traced.sensitivity[:, :, 0])
-    size = _size(result - np.mean(result, axis=0))
+    size = _size(terms - np.mean(terms, axis=0))
     return Answer(np.stack(answers, axis=2), misfit / max(size, 1e-300))
 
 
@@ -307,9 +291,9 @@ def _terms(
 ) -> FloatArray:  # fmt: skip
     """Return the terms of a law (n, moved, size) along x (nx, n) and u (nu, n), from z0 on."""
     x = x.copy()
-    x[list(law.own)] = 0.0
-    if law.own:
-        x[list(law.own)] = _own_states(law, t, x, u, p, z0).T
+    x[list(law.states)] = 0.0
+    if law.states:
+        x[list(law.states)] = _own_states(law, t, x, u, p, z0).T
     function, count = (law.added, 1) if finite else (law.by_gain, len(law.moved))
     return function(len(t), t[None], x, u, p).reshape(len(t), count, -1)
 
@@ -318,7 +302,7 @@ def _own_states(
     law: Law, t: FloatArray, x: FloatArray, u: FloatArray, p: FloatArray, z0: FloatArray
 ) -> FloatArray:
     """Return an effect's own states (n, nz) along x (nx, n), in which they are 0, and u (nu, n)."""
-    n, m, ramps = len(t), len(law.own), np.diff(u) / np.diff(t)
+    n, m, ramps = len(t), len(law.states), np.diff(u) / np.diff(t)
     ends = slice(None, -1), slice(1, None)
     rest = law.rest(n, t[None], x, u, p)
     turns = [law.turning(n - 1, t[None, at], x[:, at], u[:, at], p, ramps) for at in ends]

@@ -2,16 +2,18 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from threading import Lock, get_ident
+
+from psa_casadi.interruption import set_within
 
 #: What is spent outside every stage.
 REST = "rest"
 
 
-@dataclass(frozen=True)
+@dataclass
 class Stage:
     """What one stage took: seconds, processor seconds of all threads, and simulations.
 
@@ -29,7 +31,7 @@ class Stage:
 class Timings:
     """The stages of one piece of work, in the order in which they began, then the rest.
 
-    The thread that made it tells the stages; runs count from whatever thread works for it.
+    The thread that made it sets the stages; runs count from whatever thread works for it.
     """
 
     def __init__(self) -> None:
@@ -48,7 +50,7 @@ class Timings:
         if get_ident() == self._thread:
             self._settle()
         named = [s for name, s in self._spent.items() if name != REST]
-        return (*named, self._spent[REST])
+        return tuple(map(replace, (*named, self._spent[REST])))
 
     @contextmanager
     def within(self, name: str) -> Iterator[None]:
@@ -68,19 +70,17 @@ class Timings:
     def count(self, *, differentiated: bool) -> None:
         """Count one simulation."""
         with self._lock:
-            now = self._spent[self._within[-1]]
-            more = now.differentiated + differentiated
-            self._spent[now.name] = replace(now, runs=now.runs + 1, differentiated=more)
+            present = self._spent[self._within[-1]]
+            present.runs += 1
+            present.differentiated += differentiated
 
     def _settle(self) -> None:
         """Add the time since the last change to the present stage."""
         with self._lock:
             now, since = (time.perf_counter(), time.process_time()), self._since
-            stage, self._since = self._spent[self._within[-1]], now
-            wall, processor = (b - a for a, b in zip(since, now, strict=True))
-            self._spent[stage.name] = replace(
-                stage, wall=stage.wall + wall, processor=stage.processor + processor
-            )
+            present, self._since = self._spent[self._within[-1]], now
+            present.wall += now[0] - since[0]
+            present.processor += now[1] - since[1]
 
 
 def _finished(stages: tuple[Stage, ...]) -> Timings:
@@ -93,18 +93,12 @@ def _finished(stages: tuple[Stage, ...]) -> Timings:
 _timings: ContextVar[Timings | None] = ContextVar("timings", default=None)
 
 
-@contextmanager
-def timed() -> Iterator[Timings]:
+def timed() -> AbstractContextManager[Timings]:
     """Record the stages of all work within.
 
     Processor time is that of the whole process, whatever else runs in it.
     """
-    timings = Timings()
-    token = _timings.set(timings)
-    try:
-        yield timings
-    finally:
-        _timings.reset(token)
+    return set_within(_timings, Timings())
 
 
 @contextmanager
@@ -126,7 +120,7 @@ def count_run(*, differentiated: bool) -> None:
 
 
 class Work:
-    """Steps of simulations times one more than the derivatives beside them: the same everywhere.
+    """Steps of simulations, times one plus their derivatives: the same everywhere.
 
     Some 60 ns of processor time each, and as much for the algebra of a fit.
     """
@@ -144,15 +138,9 @@ class Work:
 _work: ContextVar[Work | None] = ContextVar("work", default=None)
 
 
-@contextmanager
-def counted() -> Iterator[Work]:
+def counted() -> AbstractContextManager[Work]:
     """Count the steps of all simulations within."""
-    work = Work()
-    token = _work.set(work)
-    try:
-        yield work
-    finally:
-        _work.reset(token)
+    return set_within(_work, Work())
 
 
 def count_steps(steps: int) -> None:

@@ -312,7 +312,7 @@ def test_slopes_are_finite(effect: Component, base: tuple[Component, ...]) -> No
 def test_ordinary_size_shows_and_costs_little(effect: Component) -> None:
     """Between 0.05 and 10 % of the range, at no more than 1.5 times the steps, at any probe.
 
-    A further resonance costs the steps of its oscillation. A weight may be 0 beside others.
+    A further resonance costs the steps of its oscillation. A weight may be 0 if others are not.
     """
     t, voltage = sine_and_steps()
     base = driven(stack("P-885.51"), t, voltage)
@@ -353,7 +353,7 @@ def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> Non
 def test_a_held_voltage_holds_the_output(effect: Component, base: tuple[Component, ...]) -> None:
     """The start at 100 V is an equilibrium of the extended model; ageing alone goes on.
 
-    Beside a single mass: the effects that act on its force.
+    With a single mass: the effects that act on its force.
     """
     model = linear(effect, 0.3, base, **HYSTERESIS)
     x = simulate(model, np.arange(11) * 10.0, np.full(11, 100.0)).displacement
@@ -451,7 +451,7 @@ def stroke(model: psa.Model) -> float:
 
 
 def tone(t: FloatArray, signal: FloatArray, frequency: float) -> complex:
-    """Return the complex amplitude of one frequency in a signal, beside its mean."""
+    """Return the complex amplitude of one frequency in a signal, without its mean."""
     angle = 2 * np.pi * frequency * t
     columns = np.column_stack([np.cos(angle), np.sin(angle), np.ones_like(t)])
     a, b, _ = np.linalg.lstsq(columns, signal, rcond=None)[0]
@@ -544,6 +544,16 @@ def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(
     assert np.abs(apart[0] - apart[1]).max() > 50 * np.abs(apart[2] - apart[3]).max()
 
 
+def read_by_the_sensor(model: psa.Model) -> tuple[FloatArray, FloatArray]:
+    """Return displacement and error of the reading, 0 at first, under two cycles of 100 V."""
+    t = np.linspace(0.0, 2.0, 4001)
+    result = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
+    x = result["displacement"]
+    residual = result["measured_displacement"] - x
+    assert residual[0] == 0.0
+    return x, residual
+
+
 def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
     """Its first harmonic has the gain as amplitude, the second what its two shares say."""
     period = 1.3e-6
@@ -551,11 +561,7 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
         SENSOR_RIPPLE, ripple_gain=2e-8, ripple_period=period, ripple_phase=0.7,
         ripple_second_cosine=0.3, ripple_second_sine=-0.4,
     )  # fmt: skip
-    t = np.linspace(0.0, 2.0, 4001)
-    result = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
-    x = result["displacement"]
-    residual = result["measured_displacement"] - x
-    assert residual[0] == 0.0
+    x, residual = read_by_the_sensor(model)
     for branch in (np.gradient(x) > 0, np.gradient(x) < 0):
         angle = 2 * np.pi * x[branch] / period
         columns = [np.ones_like(angle), *(f(k * angle) for k in (1, 2) for f in (np.sin, np.cos))]
@@ -570,11 +576,7 @@ def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() 
     place = 4e-6
     model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=0.003)
     width = 0.003 * stroke_scale(model.values)
-    t = np.linspace(0.0, 2.0, 4001)
-    result = simulated(model, t, 50.0 * (1.0 - np.cos(2 * np.pi * t)))
-    x = result["displacement"]
-    residual = result["measured_displacement"] - x
-    assert residual[0] == 0.0
+    x, residual = read_by_the_sensor(model)
     far = np.abs(x - place) > 10 * width
     np.testing.assert_allclose(residual[far], 3e-8 * (x[far] > place), rtol=0, atol=1e-15)
     for branch in (np.gradient(x) > 0, np.gradient(x) < 0):

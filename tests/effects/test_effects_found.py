@@ -1,4 +1,4 @@
-"""Several modes at once: read off a residual, fitted beside the base, exported like any effect."""
+"""Several modes at once: read off a residual, fitted with the base, exported like any effect."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -87,12 +87,12 @@ def test_its_equations_are_those_of_modal_superposition() -> None:
     voltage = multisine(time, 0.0, 80.0, (20.0, 1500.0), seed=3)
     voltage *= np.clip((time - 0.002) / 0.01, 0.0, 1.0)  # it begins at rest
     base = psa.simulate(psa.stack_model("P-885.51"), time, voltage, rtol=1e-6)
-    item = psa.simulate(model, time, voltage, rtol=1e-6)
+    extended = psa.simulate(model, time, voltage, rtol=1e-6)
     k = model.values
     rest = base.states["f_out"] * (1.0 / k["k_P"] + 1.0 / k["k_B"])
     added = sum(share * response(f, z, rest, time) for f, z, share in HIDDEN[:2])
     size = np.ptp(added)
-    np.testing.assert_allclose(item.displacement - base.displacement, added, atol=2e-3 * size)
+    np.testing.assert_allclose(extended.displacement - base.displacement, added, atol=2e-3 * size)
 
 
 def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN) -> psa.Record:
@@ -111,7 +111,7 @@ def shaken_stack(seed: int, modes: Sequence[tuple[float, float, float]] = HIDDEN
 
 
 @slow
-def test_several_modes_are_found_together_and_again_from_what_was_found() -> None:
+def test_several_modes_are_identified_together_and_again_from_the_result() -> None:
     like = [psa.EFFECTS[n] for n in ("structural_mode", "drive_lag", "sensor_delay")]
     more = [psa.EFFECTS[n] for n in ("hysteresis_memory", "slow_creep", "load_stiffness")]
     result = psa.diagnose([shaken_stack(11)], effects=[*like, *more])
@@ -173,7 +173,7 @@ def fast() -> Record:
     return _recorded(5e-6, (300.0, 1100.0, 2900.0, 7000.0))
 
 
-def test_a_current_tells_the_capacitance(fast: Record) -> None:
+def test_a_current_determines_the_capacitance(fast: Record) -> None:
     capacitance = capacitance_of([fast])
     assert capacitance is not None
     assert capacitance.value == pytest.approx(C_P, abs=4.0 * capacitance.error)
@@ -200,7 +200,7 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
 
 
 @slow
-def test_a_current_that_is_not_the_stack_s_tells_nothing(fast: Record) -> None:
+def test_a_current_that_is_not_the_stack_s_determines_nothing(fast: Record) -> None:
     noise = np.random.default_rng(1).standard_normal(fast.n)
     assert fast.current is not None
     for current in (noise, np.zeros(fast.n), None, 1e6 * fast.current, -fast.current):

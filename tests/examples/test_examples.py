@@ -1,4 +1,4 @@
-"""Every example runs and finds what it says; the command shows, copies and runs them."""
+"""Every example runs with its figures; the command prints, copies and runs them."""
 
 import json
 import re
@@ -78,7 +78,7 @@ def test_the_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
             result[f"error at 2 us, {how} [%]"] for how in ("values held", "with slopes")
         )
         assert sloped > held
-    if name == "uncertainty_in_fmpy":  # two ways; 20 samples tell one to a sixth
+    if name == "uncertainty_in_fmpy":  # two ways; 20 samples determine one to a sixth
         *_, by_points, by_samples = result.values()
         assert by_samples == pytest.approx(by_points, rel=0.5)
 
@@ -94,7 +94,7 @@ def test_every_example_and_recipe_has_a_title_of_its_own() -> None:
 
 
 def test_twelve_lines_make_a_model() -> None:
-    """As the title says: what `model` does and the exports, the documentation left out."""
+    """As in the title: what `model` does and the exports, the documentation left out."""
     text = examples()["van_der_pol"].text
     body = text.partition("def model()")[2].partition("\n\n\n")[0].splitlines()[2:]
     exports = [line for line in text.splitlines() if line.startswith("    psa.export_")]
@@ -157,7 +157,7 @@ def test_an_example_is_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         (["ci", "--copy-only"], "--copy-only needs a folder"),
     ],
 )
-def test_mistakes_are_told(words: list[str], sentence: str) -> None:
+def test_mistakes_are_named(words: list[str], sentence: str) -> None:
     result = _run(*words)
     assert result.code == 2
     assert sentence in result.words

@@ -83,7 +83,7 @@ def _script(recipe: str, name: str) -> Script:
     return next(s for s in examples()[recipe].scripts if s.name == name)
 
 
-def test_every_page_says_what_was_executed() -> None:
+def test_every_page_has_what_was_executed() -> None:
     assert set(RECIPES) >= {"openmodelica", "dymola", "simulink", "omsimulator", "fmpy", "ci"}
     for name in RECIPES:
         assert "\n## What was executed\n" in examples()[name].text, name
@@ -168,7 +168,7 @@ def test_the_matlab_script() -> None:
 def test_the_scripts_for_omsimulator_wire_what_fits(
     made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Run with a module that only notes what it is asked: ports exist, and fit by pairs."""
+    """Run with a module that only notes its calls: ports exist, and fit by pairs."""
     tool = MagicMock()
     tool.CRef = lambda *names: names
     monkeypatch.setitem(sys.modules, "OMSimulator", tool)

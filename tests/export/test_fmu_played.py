@@ -23,7 +23,7 @@ from psa_casadi.export.importer.play import Run, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.export.importer.signals import Signals
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 from tests.export.ssp_master import SspArchive, couple
@@ -74,7 +74,7 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
     for base in (item, whole):
         model = extended(base, [table[n] for n in names]).with_values(values)
         free = ["k", *(n for n in values if n != "k")]
-        start = begun(model, T, U, {})
+        start = start_for(model, T, U, {})
         s0 = start.by_parameter[:, [model.parameter_names.index(n) for n in free]]
         steps = psa.run(model, T, U, start.x, rtol=1e-8, unknowns=free, s0=s0, outputs=["y"])
         items.append((steps.y[:, 0], steps.sensitivity[:, 0]))

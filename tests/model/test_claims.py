@@ -36,7 +36,7 @@ def name_of(effects: tuple[psa.Component, ...]) -> str:
     return "all" if effects == ALL else "+".join(e.name for e in effects) or "base"
 
 
-#: The functions of model.h that the Python side compiles, seen from outside the library.
+#: The functions of model.h that the Python side compiles, visible from outside the library.
 _EXPORTS = """\
 #include "model.h"
 #define FACE(name) __attribute__((visibility("default"))) int test_##name
@@ -68,7 +68,7 @@ def values_of(model: psa.Model, point: Point) -> list[FloatArray]:
 
 
 def c_values(model: psa.Model, name: str, point: Point, sizes: list[int]) -> list[FloatArray]:
-    """Call one compiled function; its results have the given sizes."""
+    """Call one compiled function; its results have these sizes."""
     results = [np.full(size, np.nan) for size in sizes]
     arrays = (point.x, point.u, model.parameter_vector(), *results)
     function = getattr(compiled(model.structure), f"test_{name}")
@@ -131,8 +131,10 @@ def test_a_gain_changes_what_is_measured(effect: psa.Component) -> None:
     voltage = 50.0 * (1.0 - np.cos(2 * np.pi * t)) + 20.0 * (t > 0.7)
     u = inputs_of(model, t, voltage, np.zeros_like(t))
     start = start_of(effect, model)
-    items = [psa.run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)]
-    assert np.abs(items[1] - items[0]).max() > 1e-4 * np.ptp(items[0])
+    off, on = [
+        psa.run(model.with_values({gain.name: g}), t, u, start).y[:, -1] for g in (0.0, step)
+    ]
+    assert np.abs(on - off).max() > 1e-4 * np.ptp(off)
 
 
 @every_effect
@@ -183,10 +185,10 @@ def test_variables_have_units_bounds_and_sizes(component: psa.Component) -> None
     assert all(0.0 < sizes[s.name] < 1e6 for s in component.states)
     held = [nominal_value(s.nominal, model.values) for s in component.sampled]
     assert all(0.0 < size < 1e6 for size in held)
-    displayed: list[psa.Input | psa.Output] = [*component.inputs, *component.outputs]
-    assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in displayed)
+    signals: list[psa.Input | psa.Output] = [*component.inputs, *component.outputs]
+    assert all(0.0 < nominal_value(v.nominal, model.values) < 1e6 for v in signals)
     variables: list[psa.Parameter | psa.State | psa.Input | psa.Output] = [*component.parameters]
-    variables += [*component.states, *component.sampled, *displayed]
+    variables += [*component.states, *component.sampled, *signals]
     for variable in variables:
         assert len(variable.description) > 3
         unit = variable.display_unit or variable.unit

@@ -57,10 +57,10 @@ PIECES = ("1e999", "NaN", "-Infinity", "9" * 5000, "[" * 3000, r'"\u0000"', '{"a
 
 def same_or_refused(text: str) -> bool:
     """Whether a text is refused as it should be; what is not must come back from a new file."""
-    texts = sentences(lambda: loads(text, "m.json"))
-    if texts:
-        assert len(texts) <= 21
-        assert all(p.startswith(("m.json", "... and")) and len(p) < 2000 for p in texts)
+    problems = sentences(lambda: loads(text, "m.json"))
+    if problems:
+        assert len(problems) <= 21
+        assert all(p.startswith(("m.json", "... and")) and len(p) < 2000 for p in problems)
         return True
     model = loads(text)
     written = dumps(model)
@@ -116,14 +116,14 @@ def edited(change: Callable[[dict[str, Any]], object]) -> str:
 
 
 def refused(change: Callable[[dict[str, Any]], object]) -> str:
-    """Return what is said of a changed file, each sentence of which begins with its name."""
-    texts = sentences(lambda: loads(edited(change), "m.json"))
-    assert all(line.startswith("m.json") for line in texts)
-    return "\n".join(texts)
+    """Return the problems of a changed file, each of which begins with its name."""
+    problems = sentences(lambda: loads(edited(change), "m.json"))
+    assert all(line.startswith("m.json") for line in problems)
+    return "\n".join(problems)
 
 
 GONE = object()
-#: What is said of a file in which a value at a place is another one, or is gone.
+#: The problem of a file in which a value at a place is another one, or is gone.
 NAMED: dict[str, tuple[str, Any]] = {
     "'components' is missing; give a list": ("components", GONE),
     "unknown name 'slow_creep' in components": ("components.+", "slow_creep"),
@@ -242,7 +242,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
-def test_what_is_no_json_is_told_in_one_short_sentence(text: str) -> None:
+def test_what_is_no_json_is_refused_in_one_short_sentence(text: str) -> None:
     (problem,) = sentences(lambda: parse_json(text, "a.json", "give another file."))
     assert problem.startswith("a.json is not JSON that can be used (")
     assert problem.endswith("); give another file.")

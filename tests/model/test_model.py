@@ -37,8 +37,8 @@ def test_a_loop_of_balances_is_named() -> None:
     loop_names = text.split(":")[1].split(";")[0].strip().split(" -> ")
     assert loop_names[0] == loop_names[-1]
     assert set(loop_names) == {"drive_voltage", "drive_current", "stack_current"}
-    item = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
-    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, item)))
+    itself = component(lambda s: psa.Equations(add={"tip_force": 2 * s.tip_force}))
+    assert "tip_force -> tip_force;" in message(lambda: psa.compose((*psa.BASE, itself)))
 
 
 def test_a_component_gives_what_it_declares_and_nothing_else() -> None:
@@ -97,18 +97,18 @@ def evidence_in(model: psa.Model) -> Evidence:
     return model.evidence
 
 
-def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
-    record, output = noisy_record(), evidence_in(evident_model())
+def test_it_has_the_ranges_of_the_record_and_the_errors_of_the_model() -> None:
+    record, evidence = noisy_record(), evidence_in(evident_model())
     rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
-    assert output.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
-    assert output.seen.rate == pytest.approx(rates.max())
-    assert output.seen.duration == record.duration
-    assert output.seen.temperature is None
-    held = output.held_out
+    assert evidence.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert evidence.seen.rate == pytest.approx(rates.max())
+    assert evidence.seen.duration == record.duration
+    assert evidence.seen.temperature is None
+    held = evidence.held_out
     assert held is not None
     assert held.interval_m.low < NOISE < held.interval_m.high
     assert held.rms_m == pytest.approx(NOISE, rel=0.15)
-    (played,) = output.runs
+    (played,) = evidence.runs
     assert (played.sha256, played.samples, played.averaged) == (record.sha256, 640, 1)
     assert played.offset_m == pytest.approx(OFFSET, abs=1e-8)
     (split,) = divided([record], ())
@@ -118,11 +118,11 @@ def test_it_says_what_the_record_has_shown_and_what_the_model_errs_by() -> None:
 
 def test_the_covariance_is_that_of_the_intervals() -> None:
     model = evident_model()
-    output, known = evidence_in(model).covariance, model.provenance.intervals
-    assert output.names == ("k_L", "A", "tau")
-    for k, name in enumerate(output.names):
+    covariance, known = evidence_in(model).covariance, model.provenance.intervals
+    assert covariance.names == ("k_L", "A", "tau")
+    for k, name in enumerate(covariance.names):
         half = 0.5 * (known[name].high - known[name].low)
-        assert 1.96 * output.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
+        assert 1.96 * covariance.matrix[k][k] ** 0.5 == pytest.approx(half, rel=0.02), name
 
 
 def test_other_values_or_physics_have_no_evidence() -> None:

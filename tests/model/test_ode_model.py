@@ -80,8 +80,8 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
     )  # fmt: skip
     room = 3.0 * np.sin(2 * math.pi * expected.t / 60.0)
     above, product = expected.y[0] - room, 2.0 * expected.y[0]
-    item = psa.run(model, expected.t, np.full((61, 1), 2.0), np.array([1.0, 0.0]), rtol=1e-10)
-    assert item.y == pytest.approx(np.column_stack([above, product]), abs=1e-7)
+    run = psa.run(model, expected.t, np.full((61, 1), 2.0), np.array([1.0, 0.0]), rtol=1e-10)
+    assert run.y == pytest.approx(np.column_stack([above, product]), abs=1e-7)
     fmu = psa.export_fmu(model, tmp_path / "rod.fmu")
     ends = np.array([(0.0, 2.0), (30.0, 2.0)], dtype=[("time", float), ("current", float)])
     result = simulate_fmu(
@@ -176,8 +176,8 @@ def test_a_table_is_the_spline_in_a_file_in_c_and_beyond_its_ends(tmp_path: Path
             psa.run(m, t, np.zeros((61, 0)), np.array([-2.0])).y[:, 0], expected, atol=1e-9
         )
     psa.export_fmu(model, tmp_path / "m.fmu")
-    displayed = simulate_fmu(str(tmp_path / "m.fmu"), stop_time=6.0, output_interval=0.1)
-    np.testing.assert_allclose(displayed["value"], expected, atol=1e-6)
+    played = simulate_fmu(str(tmp_path / "m.fmu"), stop_time=6.0, output_interval=0.1)
+    np.testing.assert_allclose(played["value"], expected, atol=1e-6)
 
 
 def test_a_table_of_two_variables_and_straight_lines() -> None:
@@ -205,7 +205,7 @@ def _solved() -> dict[str, Any]:
     return {"x": u, "ode": root(x0=0.0, p=u)["x"]}
 
 
-#: What is wrong, what is given, words of the sentence.
+#: What is wrong, the inputs, words of the sentence.
 WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "unknown symbol": (lambda: {"x": X, "ode": K * X}, {}, "'ode' uses the symbol 'k'"),
     "unknown symbol in y": (lambda: {"x": X, "ode": X, "y": K}, {}, "'y' uses the symbol 'k'"),
@@ -254,7 +254,7 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_what_is_wrong_is_said_in_a_sentence(what: str) -> None:
+def test_a_mistake_is_named_in_a_sentence(what: str) -> None:
     inputs, words, sentence = WRONG[what]
     with pytest.raises(psa.InputError) as caught:
         psa.ode_model(inputs(), **{"name": "model", **words})
@@ -341,7 +341,7 @@ def install(site: Path, text: str) -> None:
 
 @pytest.fixture
 def neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A current folder with files of the names of what is imported; each tells that it ran."""
+    """A current folder with files of the names of what is imported; each leaves a file if run."""
     here = tmp_path / "here"
     here.mkdir()
     text = "from pathlib import Path; Path(__file__).with_suffix('.ran').touch()\n"
@@ -378,7 +378,7 @@ def test_a_neighbour_stands_for_nothing_that_is_missing(
     with pytest.raises(psa.InputError, match=r"No module named 'gratings'"):
         known_effects()
     assert not list(neighbours.glob("*.ran"))
-    assert "encoder_ripple" in psa.own_effects("gratings")  # it is asked for
+    assert "encoder_ripple" in psa.own_effects("gratings")  # by its name
     assert (neighbours / "gratings.ran").is_file()
 
 
@@ -391,7 +391,7 @@ def test_a_neighbour_stands_for_nothing_that_is_missing(
         (RIPPLE.replace("s.x /", "s.no_such_symbol /"), "no_such_symbol"),
     ],
 )
-def test_a_module_that_does_not_do_is_told_in_a_sentence(
+def test_a_module_that_does_not_fit_is_refused_in_a_sentence(
     text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "gratings.py").write_text(text)
@@ -411,7 +411,7 @@ def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
     )  # fmt: skip
     t = 0.02 * np.arange(201.0)
     u = np.sin(2.0 * t)
-    displayed = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
+    velocity = psa.run(model, t, u[:, None], np.zeros(2), rtol=1e-9, hold="zero").y[:, 0]
     path = tmp_path / "any.fmu"
     psa.export_fmu(model, path)
     played = simulate_fmu(
@@ -421,4 +421,4 @@ def test_names_that_stacks_have_are_free(tmp_path: Path) -> None:
         ),
     )  # fmt: skip
     again = np.interp(t, played["time"], played["velocity"])
-    assert np.max(np.abs(again - displayed)) < 1e-5 * np.ptp(displayed)
+    assert np.max(np.abs(again - velocity)) < 1e-5 * np.ptp(velocity)

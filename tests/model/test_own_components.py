@@ -149,78 +149,79 @@ def test_what_could_not_be_read_again_is_not_saved() -> None:
         dumps(psa.ode_model({"x": x, "ode": -x, "y": x}, name="many"))
 
 
-def own(content: dict[str, Any]) -> dict[str, Any]:
+def entry(content: dict[str, Any]) -> dict[str, Any]:
     table: dict[str, Any] = content["own"]["motor"]
     return table
 
 
 HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "code": (
-        lambda m: own(m)["equations"]["der"].update(current="().__class__.__base__"),
+        lambda m: entry(m)["equations"]["der"].update(current="().__class__.__base__"),
         "'own.motor.equations.der.current' has a Python Attribute",
     ),
-    "no text": (lambda m: own(m)["equations"]["der"].update(current=3), "give a text"),
-    "no equations": (lambda m: own(m).pop("equations"), "lacks the derivative of the state"),
+    "no text": (lambda m: entry(m)["equations"]["der"].update(current=3), "give a text"),
+    "no equations": (lambda m: entry(m).pop("equations"), "lacks the derivative of the state"),
     "a state that is none": (
-        lambda m: own(m)["equations"]["der"].update(z="1"), "the state 'z', which it does not",
+        lambda m: entry(m)["equations"]["der"].update(z="1"), "the state 'z', which it does not",
     ),
     "a symbol that is none": (
-        lambda m: own(m)["equations"]["der"].update(current="z"), "no symbol named 'z'",
+        lambda m: entry(m)["equations"]["der"].update(current="z"), "no symbol named 'z'",
     ),
     "a balance that is none": (
-        lambda m: own(m)["equations"].update(add={"z": "1"}), "adds to 'z', which is no balance",
+        lambda m: entry(m)["equations"].update(add={"z": "1"}), "adds to 'z', which is no balance",
     ),
     "a loop": (
-        lambda m: own(m)["equations"].update(add={"tip_force": "tip_force"}), "form a loop",
+        lambda m: entry(m)["equations"].update(add={"tip_force": "tip_force"}), "form a loop",
     ),
-    "a name": (lambda m: own(m)["states"][0].update(name="<b>"), "'<b>' cannot name a variable"),
+    "a name": (lambda m: entry(m)["states"][0].update(name="<b>"), "'<b>' cannot name a variable"),
     "a name of the file": (
         lambda m: m["own"].update({"../x": m["own"].pop("motor")}), "'../x' cannot name a variable",
     ),
-    "a unit": (lambda m: own(m)["states"][0].update(unit="furlang"), "furlang"),
+    "a unit": (lambda m: entry(m)["states"][0].update(unit="furlang"), "furlang"),
     "a name twice": (
-        lambda m: own(m)["states"].append(dict(own(m)["states"][0])), "declare 'current'",
+        lambda m: entry(m)["states"].append(dict(entry(m)["states"][0])), "declare 'current'",
     ),
     "a port": (
-        lambda m: own(m).update(ports=[{"kind": "rate", "variable": "z", "unit": "1/s"}]),
+        lambda m: entry(m).update(ports=[{"kind": "rate", "variable": "z", "unit": "1/s"}]),
         "the rate of z, which it does not have",
     ),
-    "a gain": (lambda m: own(m).update(gain="z"), "'z' is a gain or linear, and no parameter"),
-    "a place": (lambda m: own(m).update(belongs_to="nowhere"), "give one of 'plant', 'drive'"),
+    "a gain": (lambda m: entry(m).update(gain="z"), "'z' is a gain or linear, and no parameter"),
+    "a place": (lambda m: entry(m).update(belongs_to="nowhere"), "give one of 'plant', 'drive'"),
     "no equation at a port": (
-        lambda m: own(m)["equations"].update(out={})
-        or own(m).update(ports=[{"kind": "output", "variable": "w", "unit": "rad/s"}]),
+        lambda m: entry(m)["equations"].update(out={})
+        or entry(m).update(ports=[{"kind": "output", "variable": "w", "unit": "rad/s"}]),
         "lacks the equation of the output 'w'",
     ),
-    "no word": (lambda m: own(m).update(belongs_to={}), "give one of 'plant', 'drive'"),
-    "a size": (lambda m: own(m)["states"][0].update(nominal=None), "give a number"),
-    "bounds": (lambda m: own(m)["parameters"][0].update(bounds=[5, 1]), "outside its bounds"),
+    "no word": (lambda m: entry(m).update(belongs_to={}), "give one of 'plant', 'drive'"),
+    "a size": (lambda m: entry(m)["states"][0].update(nominal=None), "give a number"),
+    "bounds": (lambda m: entry(m)["parameters"][0].update(bounds=[5, 1]), "outside its bounds"),
     "too much": (
-        lambda m: own(m).update(states=own(m)["states"] * 2_000), "have 4007 variables, of which",
+        lambda m: entry(m).update(states=entry(m)["states"] * 2_000),
+        "have 4007 variables, of which",
     ),
     "too many expressions": (
-        lambda m: own(m)["equations"].update(where={f"c{k}": "x" for k in range(20_000)}),
+        lambda m: entry(m)["equations"].update(where={f"c{k}": "x" for k in range(20_000)}),
         "have 20004 expressions",
     ),
     "too long": (
-        lambda m: own(m)["equations"].update(where={f"c{k}": "x + " * 999 for k in range(200)}),
+        lambda m: entry(m)["equations"].update(where={f"c{k}": "x + " * 999 for k in range(200)}),
         "characters of equations, of which a file holds 500000",
     ),
     "not named": (lambda m: m.update(own={}), "unknown name 'motor'"),
-    "a sample period": (lambda m: own(m).update(sample_period="z"), "sample period"),
+    "a sample period": (lambda m: entry(m).update(sample_period="z"), "sample period"),
     "an FMU": (
-        lambda m: own(m).update(fmu={"file": "x.fmu", "sha256": ""}), "is not opened from here",
+        lambda m: entry(m).update(fmu={"file": "x.fmu", "sha256": ""}), "is not opened from here",
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_a_mistake_in_an_own_component_is_named(case: str) -> None:
-    change, statement = HOSTILE[case]
+    change, problem = HOSTILE[case]
     content = json.loads(dumps(motor()))
     change(content)
     began = time.process_time()
-    with pytest.raises(psa.InputError, match=r"m\.json") as output:
+    with pytest.raises(psa.InputError, match=r"m\.json") as caught:
         loads(json.dumps(content), "m.json")
-    assert statement in str(output.value)
+    assert problem in str(caught.value)
     assert time.process_time() - began < 2.0

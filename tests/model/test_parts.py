@@ -13,9 +13,7 @@ from scipy.interpolate import CubicSpline
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.nanopositioner import (
-    positioner_plant,
-)
+from psa_casadi.model.nanopositioner import positioner_plant
 from psa_casadi.units import BoolArray, FloatArray
 from psa_casadi.variables import nominal_value
 from tests.export.modelica_runs import simulated
@@ -194,7 +192,7 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
 
 
 @pytest.mark.parametrize(
-    ("made", "said"),
+    ("make", "message"),
     [
         (lambda: psa.part_model("voltage"), "voltage_amplifier"),
         (lambda: psa.part_model("voltage_amplifier", speed=1.0), "no parameter 'speed'"),
@@ -204,9 +202,9 @@ def test_the_plain_loop_has_the_reference_s_stack() -> None:
         ),
     ],
 )
-def test_what_is_no_part_of_a_stack_is_refused(made: Callable[[], psa.Model], said: str) -> None:
-    with pytest.raises(psa.InputError, match=said):
-        made()
+def test_what_is_no_part_of_a_stack_is_refused(make: Callable[[], psa.Model], message: str) -> None:
+    with pytest.raises(psa.InputError, match=message):
+        make()
 
 
 @pytest.mark.parametrize("name", psa.PARTS)
@@ -267,9 +265,9 @@ def test_a_connected_model_has_the_equations_of_its_parts() -> None:
         tip = np.array([x[stack.state_names.index("x")], x[stack.state_names.index("v_x")]])
         slope, out = stage.structure.f(0.0, x_f, tip, stage.parameter_vector())
         force = float(out[stage.output_names.index("reaction_force")])
-        item, displayed = stack.structure.f(0.0, x, [30.0, force], stack.parameter_vector())
+        rates, y = stack.structure.f(0.0, x, [30.0, force], stack.parameter_vector())
         got = both.structure.f(0.0, [*x, *x_f], [30.0], both.parameter_vector())
-        parts = [np.array(v).ravel() for v in (item, slope, displayed, out)]
+        parts = [np.array(v).ravel() for v in (rates, slope, y, out)]
         expected = np.concatenate(parts[:2]), np.concatenate(parts[2:])
         for result, wanted in zip(got, expected, strict=True):
             np.testing.assert_allclose(np.array(result).ravel(), wanted, rtol=1e-13)
@@ -331,7 +329,7 @@ def test_the_closed_loop_is_that_of_an_independent_simulation(compensated: bool)
 
 @pytest.mark.parametrize("stack", ["P-885.51", "PTBS200", "WYDS0808020"])
 def test_the_tuned_loop_keeps_its_margins(stack: str) -> None:
-    """The sensitivity asked for is met with the resonance where it is, and used up nearly."""
+    """The required sensitivity is met with the resonance where it is, and used up nearly."""
     plant = positioner_plant(stack).model()
     table = {}
     for limit in (1.4, 1.6):

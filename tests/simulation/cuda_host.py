@@ -37,7 +37,7 @@ _ITEMS = {**{name: kind for name, (kind, _) in _SCALARS.items()}, "char": np.int
 
 
 class HostCuda:
-    """The few names of the module cupy; `free` bytes of memory are said to be there."""
+    """The few names of the module cupy; a device with `free` bytes of memory."""
 
     asarray, asnumpy = staticmethod(np.array), staticmethod(np.array)
 
@@ -80,10 +80,10 @@ class HostModule:
         wanted = [" ".join(q.replace("const", "").split()) for q in result[1].split(",")]
 
         def launch(grid: tuple[int], block: tuple[int], arguments: tuple[Any, ...]) -> None:
-            items = [_passed(q, a) for q, a in zip(wanted, arguments, strict=True)]
+            passed = [_passed(q, a) for q, a in zip(wanted, arguments, strict=True)]
             for number in range(grid[0] * block[0]):
                 self._library.psa_at(*(ctypes.c_longlong(k) for k in _place(number, block[0])))
-                getattr(self._library, name)(*items)
+                getattr(self._library, name)(*passed)
             self._launches.append(grid[0] * block[0])
 
         return launch

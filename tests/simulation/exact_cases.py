@@ -129,6 +129,6 @@ def stepped(
     return y[:, model.output_names.index(OUTPUT)]
 
 
-def error(found: FloatArray, true: FloatArray) -> float:
+def error(values: FloatArray, true: FloatArray) -> float:
     """Return the largest difference over the range."""
-    return float(np.abs(found - true).max() / np.ptp(true))
+    return float(np.abs(values - true).max() / np.ptp(true))

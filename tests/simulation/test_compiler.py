@@ -1,4 +1,4 @@
-"""Which C compiler is used, and what is said where there is none."""
+"""Which C compiler is used, the message without one, and the cache of what it makes."""
 
 import ctypes
 import errno
@@ -6,17 +6,24 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from psa_casadi import cache, files
+from psa_casadi.components import BASE
 from psa_casadi.errors import InputError, MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
 from psa_casadi.export.fmu.platforms import host_platform as host
 from psa_casadi.files import replace_durably
+from psa_casadi.model.compose import compose
 from psa_casadi.simulation import compiler
+from psa_casadi.simulation.compiler import generate_c
+from psa_casadi.simulation.stepper import SOURCES
 
 ZIG = [sys.executable, "-m", "ziglang", "cc"]
 
@@ -47,23 +54,18 @@ def test_the_systems_compiler_comes_before_zig(monkeypatch: pytest.MonkeyPatch) 
 def test_flags_of_the_environment_come_last(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    commands: list[Sequence[str]] = []
-    run_it = compiler.run_compiler
-
-    def told(command: Sequence[str], directory: Path) -> None:
-        commands.append(command)
-        run_it(command, directory)
-
-    monkeypatch.setattr(compiler, "run_compiler", told)
+    recorder = Mock(wraps=compiler.run_compiler)
+    monkeypatch.setattr(compiler, "run_compiler", recorder)
     monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path / "cache"))
     made = []
     for flags in ("", "-O0 '-DWORDS=a b'"):
         monkeypatch.setenv("PSA_CASADI_CFLAGS", flags)
         made.append(compiler.shared_library({"a.c": "int a;"}, (), ("-O1",)))
     assert made[0] != made[1]
-    at = commands[1].index("-O1")
-    assert commands[1][at + 1 : at + 3] == ["-O0", "-DWORDS=a b"]
-    assert "-O0" not in commands[0]
+    plain, extended = (call.args[0] for call in recorder.call_args_list)
+    at = extended.index("-O1")
+    assert extended[at + 1 : at + 3] == ["-O0", "-DWORDS=a b"]
+    assert "-O0" not in plain
     monkeypatch.setenv("PSA_CASADI_CFLAGS", "'-O0")
     with pytest.raises(MachineError, match=r"PSA_CASADI_CFLAGS is .*no row of flags.*-Og"):
         compiler.shared_library({"a.c": "int a;"}, ())
@@ -118,7 +120,7 @@ def test_without_zig_the_host_is_compiled_by_its_own_compiler(
     assert "-target" not in commands[0]
 
 
-SEEN = '__attribute__((visibility("default")))'
+EXPORTED = '__attribute__((visibility("default")))'
 posix = pytest.mark.skipif(sys.platform == "win32", reason="owners and permissions of POSIX")
 
 
@@ -142,7 +144,7 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
 
 def library(number: int = 42) -> Path:
     """Return a library with a function f() that returns the number."""
-    text = f"{SEEN} double f(void) {{ return {number}; }}"
+    text = f"{EXPORTED} double f(void) {{ return {number}; }}"
     return compiler.shared_library({"a.c": text}, ())
 
 
@@ -225,6 +227,19 @@ def test_a_damaged_library_is_made_again(damage: str, calls: list[Path]) -> None
     assert path.parent.stat().st_mode & 0o777 == 0o700
 
 
+def test_threads_that_want_one_model_compile_it_once(calls: list[Path]) -> None:
+    both, text = threading.Barrier(2), generate_c(compose(BASE).structure, sensitivities=True)
+
+    def wanted(_: int) -> Path:
+        both.wait()
+        return compiler.shared_library(text, SOURCES)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(wanted, range(2))
+    assert first == second
+    assert len(calls) == 1
+
+
 @posix
 def test_what_killed_runs_left_in_the_cache_goes(calls: list[Path]) -> None:
     room = cache.cache_directory() / "models"
@@ -276,7 +291,7 @@ def test_a_cache_that_cannot_be_trusted_is_left_alone(
     if (case, level) == ("a dangling link", "cache"):
         pytest.skip("the folder that the link names is made")
     wanted = tmp_path / "cache"
-    make, statement = UNUSABLE[case]
+    make, reasons = UNUSABLE[case]
     make(wanted if level == "cache" else wanted / "models")
     with caplog.at_level(logging.WARNING, "psa_casadi"):
         first, second = library(), library(7)
@@ -286,7 +301,7 @@ def test_a_cache_that_cannot_be_trusted_is_left_alone(
     assert first.is_relative_to(tmp_path / "private")
     assert len(caplog.records) == 1, caplog.text
     assert caplog.records[0].getMessage().startswith("The cache folder ")
-    assert any(word in caplog.text for word in statement.split("|")), caplog.text
+    assert any(word in caplog.text for word in reasons.split("|")), caplog.text
 
 
 @posix
@@ -324,7 +339,7 @@ def test_a_full_disk_is_tried_once(
     assert not list((tmp_path / "cache" / "models").iterdir())
 
 
-def test_a_folder_that_lets_no_program_run_is_told(
+def test_a_folder_that_lets_no_program_run_is_an_error(
     tmp_path: Path, calls: list[Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     load, noexec = ctypes.CDLL, [tmp_path / "cache"]
@@ -343,13 +358,13 @@ def test_a_folder_that_lets_no_program_run_is_told(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the rules of the desktop's specification")
-@pytest.mark.parametrize("given", ["", "relative/path", "."])
+@pytest.mark.parametrize("variable", ["", "relative/path", "."])
 def test_an_empty_or_relative_cache_variable_counts_as_unset(
-    given: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("PSA_CASADI_CACHE", raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("XDG_CACHE_HOME", given)
+    monkeypatch.setenv("XDG_CACHE_HOME", variable)
     assert cache.cache_directory() == tmp_path / ".cache" / "psa_casadi"
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     assert cache.cache_directory() == tmp_path / "xdg" / "psa_casadi"

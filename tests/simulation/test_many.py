@@ -1,13 +1,11 @@
-"""Many sets of parameters at once: the bits of each alone, whatever stands beside it."""
+"""Many sets of parameters at once: the bits of each alone, whatever the others are."""
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError, MachineError
@@ -53,7 +51,7 @@ def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
     model = stack("P-885.51")
     if effect:
         gains = {"load_stiffness": "load_gain", "rate_dependent_hysteresis": "rate_gain"}
-        model = model.with_effect(_effect(effect), {gains[effect]: 0.02})
+        model = model.with_effect(EFFECTS[effect], {gains[effect]: 0.02})
     values = sets(model, 9)
     together = simulate_many(model, values, record())
     assert together.shape == (9, 600)
@@ -62,18 +60,8 @@ def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
     assert np.array_equal(simulate_many(model, values[::-1], record()), together[::-1])
 
 
-def test_a_set_that_cannot_be_simulated_leaves_the_others_alone() -> None:
-    model = stack("PTBS200")
-    lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
-    items = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
-    values = simulate_many(model, items, record())
-    assert np.isnan(values[1, -1])
-    assert np.isfinite(values[[0, 2]]).all()
-    assert np.array_equal(values[[0, 2]], simulate_many(model, [items[0], items[2]], record()))
-
-
 def test_what_is_kept_of_each_set() -> None:
-    """Whole rows, a number and an array of each set; groups of four lanes and the stepper alike."""
+    """Whole rows, a number and an array of each set; of groups of four lanes and of the stepper."""
     model = stack("P-885.51")
     values = sets(model, 5)
     for one in (record(), record(uneven=True)):
@@ -98,10 +86,6 @@ def test_sets_by_the_names_of_parameters() -> None:
         simulate_many(model, {"stiffness": [1.0]}, record())
     with pytest.raises(InputError, match="outside its bounds"):
         simulate_many(model, {"n": [1.5, -1.0]}, record())
-
-
-def _effect(name: str) -> Component:
-    return EFFECTS[name]
 
 
 #: Memory in which some of nine sets' displacements fit at a time.
@@ -144,6 +128,8 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
     values: list[dict[str, float]] = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
     rows = simulate_many(model, values, record())
     assert np.isnan(rows[1, -1])
+    assert np.isfinite(rows[[0, 2]]).all()
+    assert np.array_equal(rows[[0, 2]], simulate_many(model, values[::2], record()))
     np.testing.assert_array_equal(simulate_many(model, values, record(), device="cuda"), rows)
     ranges = simulate_many(model, values, record(), reduce="range", device="cuda")
     np.testing.assert_array_equal(ranges, np.ptp(rows, axis=1))
@@ -166,8 +152,8 @@ def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
     gain = EFFECTS[effect].gain
     assert gain is not None
     model = stack("P-885.51").with_effect(EFFECTS[effect], {gain: 0.01})
-    items = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
-    models = [model.with_values(values) for values in items]
+    changed = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
+    models = [model.with_values(values) for values in changed]
     t, u = record().time, record_inputs(model, record(), 600)
     p, nominal = (
         np.array(rows).T
@@ -178,7 +164,7 @@ def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
     assert np.ptp(alone, axis=1).any()
 
 
-def test_what_a_gpu_cannot_do_is_told(host: HostCuda) -> None:
+def test_what_a_gpu_cannot_do_is_refused(host: HostCuda) -> None:
     model = stack("P-885.51")
     with pytest.raises(InputError, match="exact steps fit: the record has 595 different time"):
         simulate_many(model, [{}], record(uneven=True), device="cuda")
@@ -194,7 +180,7 @@ def test_what_a_gpu_cannot_do_is_told(host: HostCuda) -> None:
     assert simulate_many(model, [], record(), device="cuda").shape == (0, 600)
 
 
-def test_a_gpu_that_fails_is_told(host: HostCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_fails_is_an_error(host: HostCuda, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(shape: object, dtype: object = None) -> None:
         raise MemoryError("out of memory allocating 512 bytes")
 
@@ -203,38 +189,23 @@ def test_a_gpu_that_fails_is_told(host: HostCuda, monkeypatch: pytest.MonkeyPatc
         simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
 
 
-class _NoDriver:
-    """The module cupy where it finds `count` devices, or no driver."""
-
-    def __init__(self, count: int | None) -> None:
-        self.cuda = SimpleNamespace(runtime=SimpleNamespace(getDeviceCount=self.devices))
-        self._count = count
-
-    def devices(self) -> int:
-        """Return how many there are."""
-        if self._count is None:
-            raise RuntimeError("cudaErrorInsufficientDriver")
-        return self._count
-
-
 @pytest.mark.parametrize(
-    ("count", "said"),
-    [(None, r"no GPU \(cudaErrorInsufficientDriver\); .*nvidia-smi"), (0, "CUDA_VISIBLE_DEVICES")],
+    ("cupy", "message"),
+    [
+        ({"side_effect": ModuleNotFoundError("No module named 'cupy'")}, r"No .*'cupy'.*\[gpu\]"),
+        (
+            {"return_value.cuda.runtime.getDeviceCount.side_effect": RuntimeError("no driver")},
+            r"no GPU \(no driver\); .*nvidia-smi",
+        ),
+        ({"return_value.cuda.runtime.getDeviceCount.return_value": 0}, "CUDA_VISIBLE_DEVICES"),
+    ],
+    ids=["no CuPy", "no driver", "no GPU"],
 )
-def test_a_missing_gpu_is_told(
-    monkeypatch: pytest.MonkeyPatch, count: int | None, said: str
+def test_a_missing_gpu_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, cupy: dict[str, object], message: str
 ) -> None:
-    monkeypatch.setattr(device, "import_module", lambda _: _NoDriver(count))
-    with pytest.raises(InputError, match=said):
-        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
-
-
-def test_a_missing_cupy_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> Any:
-        raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-    monkeypatch.setattr(device, "import_module", absent)
-    with pytest.raises(InputError, match=r"No module named 'cupy'.*psa-casadi\[gpu\]"):
+    monkeypatch.setattr(device, "import_module", Mock(**cupy))
+    with pytest.raises(InputError, match=message):
         simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
 
 

@@ -1,4 +1,4 @@
-"""Several outputs of one run: both ways give the same, columns are those of runs of their own.
+"""Several outputs of one run: both ways give the same, columns are those of separate runs.
 
 And exact steps where equations jump by the input, which is known at every instant of a step.
 """
@@ -49,11 +49,11 @@ def _traced(case: Case, outputs: tuple[str, ...], hold: str, *, stepped: bool) -
     return trace(model, t, u, x0, way=way, outputs=outputs, unknowns=unknowns, hold=hold)
 
 
-def _off(found: FloatArray, true: FloatArray) -> float:
+def _off(values: FloatArray, true: FloatArray) -> float:
     """Return the largest difference of a column over its largest value."""
     size = np.abs(true).max(axis=0)
     assert (size > 0.0).all()
-    return float((np.abs(found - true).max(axis=0) / size).max())
+    return float((np.abs(values - true).max(axis=0) / size).max())
 
 
 @pytest.mark.parametrize("hold", ["linear", "zero"])

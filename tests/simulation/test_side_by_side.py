@@ -65,18 +65,18 @@ def test_models_without_a_displacement_are_compiled_for_all_outputs(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Where exact steps do not fit, the stepper is."""
-    texts: set[tuple[str, ...]] = set()
+    compiled_outputs: set[tuple[str, ...]] = set()
     ready: list[Model] = []
 
     def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
-        texts.add(outputs)
+        compiled_outputs.add(outputs)
         return exact.why_not(structure, outputs)
 
     monkeypatch.setattr(module, "why_not", why_not)
     monkeypatch.setattr(module, "make_ready", ready.append)
     sampled = loop()
     compiled([motor(), sampled])
-    assert texts == {("w", "i"), sampled.output_names}
+    assert compiled_outputs == {("w", "i"), sampled.output_names}
     assert ready == [sampled]
 
 
@@ -100,22 +100,22 @@ def test_the_number_of_threads_is_restored() -> None:
         assert _threads() == before
 
 
-@pytest.mark.parametrize(("wanted", "own"), [("1", True), ("2", False), ("many", False)])
+@pytest.mark.parametrize(("wanted", "alone"), [("1", True), ("2", False), ("many", False)])
 def test_work_has_the_threads_that_are_wanted(
-    wanted: str, own: bool, monkeypatch: pytest.MonkeyPatch
+    wanted: str, alone: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is no number counts as nothing said: a thread for each core."""
+    """A value that is no number counts as none: a thread for each core."""
     monkeypatch.setattr("os.cpu_count", lambda: 3)
     monkeypatch.setenv(VARIABLE, wanted)
     results = side_by_side(lambda _: threading.get_ident(), range(3))
-    assert (set(results) == {threading.get_ident()}) == own
+    assert (set(results) == {threading.get_ident()}) == alone
 
 
 MODEL = compose(BASE)
 
 
 def _simulate(unknowns: list[str]) -> None:
-    with stage("told by a worker"):
+    with stage("in a worker"):
         t = np.linspace(0.0, 1e-3, 5)
         x0 = np.zeros(len(MODEL.state_names))
         run(MODEL, t, np.zeros((5, len(MODEL.input_names))), x0, unknowns=unknowns)
@@ -139,9 +139,9 @@ def test_stages_count_for_themselves_and_simulations_of_all_threads(
         _work()
         _work()
     table = {s.name: s for s in spent.stages}
-    assert list(table) == ["told by a worker", "outer", "inner", REST]
+    assert list(table) == ["in a worker", "outer", "inner", REST]
     assert (table["outer"].runs, table["outer"].differentiated) == (6, 4)
-    assert table["told by a worker"].runs == 3
+    assert table["in a worker"].runs == 3
     assert table["inner"].wall > 0.09 > table["outer"].wall
     assert table["inner"].processor < 0.09
 

@@ -1,9 +1,5 @@
 """The stepper: accuracy, order, stability, cost, independence of the samples; starts and errors."""
 
-import threading
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -14,11 +10,10 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.structure import structure_of
-from psa_casadi.simulation import compiler
 from psa_casadi.simulation.compiler import fingerprint, generate_c
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import start_state
-from psa_casadi.simulation.stepper import SOURCES, SimulationError, run
+from psa_casadi.simulation.stepper import SimulationError, run
 from psa_casadi.units import FloatArray
 from tests.model.stack_models import LINEAR, jacobian, sine, stack
 
@@ -27,7 +22,7 @@ from tests.model.stack_models import LINEAR, jacobian, sine, stack
     ("model", "factor"),
     [
         (stack("P-885.51", **LINEAR), 10.0),
-        (stack("P-885.51"), 30.0),  # a step over a reversal costs more than its estimate says
+        (stack("P-885.51"), 30.0),  # a step over a reversal errs by more than its estimate
         (stack("PTBS200"), 150.0),  # a light resonance adds up the errors of its many periods
     ],
     ids=["linear", "hysteresis", "ringing"],
@@ -182,33 +177,6 @@ def test_bad_samples_are_named() -> None:
         run(model, np.array([0.0, 1.0]), np.zeros((2, 1)), np.zeros(3), hold="cubic")
     for words in ("array u has the shape (2, 1)", "array x0", "hold 'cubic'"):
         assert words in str(caught.value)
-
-
-@pytest.fixture
-def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Commands that the compiler is called with; the cache is empty."""
-    made, run_it = [], compiler.run_compiler
-
-    def counted(command: list[str], directory: Path) -> None:
-        made.append(command)
-        run_it(command, directory)
-
-    monkeypatch.setenv("PSA_CASADI_CACHE", str(tmp_path))
-    monkeypatch.setattr(compiler, "run_compiler", counted)
-    return made
-
-
-def test_threads_that_want_one_model_compile_it_once(calls: list[list[str]]) -> None:
-    both, text = threading.Barrier(2), generate_c(compose(BASE).structure, sensitivities=True)
-
-    def wanted() -> Path:
-        both.wait()
-        return compiler.shared_library(text, SOURCES)
-
-    with ThreadPoolExecutor(2) as pool:
-        first, second = (job.result() for job in [pool.submit(wanted) for _ in range(2)])
-    assert first == second
-    assert len(calls) == 1
 
 
 def test_a_fingerprint_differs_where_the_generated_text_does() -> None:

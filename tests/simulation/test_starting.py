@@ -28,9 +28,9 @@ def _extended() -> Model:
     "model", [_extended(), compose(SIMPLIFIED)], ids=["extended cascade", "one mass"]
 )
 def test_another_stiffness_changes_forces_and_no_displacement(model: Model) -> None:
-    item = "k_B" if "k_B" in model.values else "k"
-    moved = chosen_start([], model, 3.0 * model.values[item])[0]
-    assert moved.values[item] == pytest.approx(3.0 * model.values[item])
+    stiffness = "k_B" if "k_B" in model.values else "k"
+    moved = chosen_start([], model, 3.0 * model.values[stiffness])[0]
+    assert moved.values[stiffness] == pytest.approx(3.0 * model.values[stiffness])
     before, after = simulate(model, TIME, VOLTAGE), simulate(moved, TIME, VOLTAGE)
     size = np.ptp(before.displacement)
     assert np.max(np.abs(after.displacement - before.displacement)) < 1e-6 * size

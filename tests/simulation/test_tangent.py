@@ -9,7 +9,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.simulation.simulate import Way, input_samples, trace
-from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.tangent import answer, course_of, law_of, opened
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import Parameter, State
@@ -22,7 +22,7 @@ def _both(
     base: Model, effect: Component, t: FloatArray, u: FloatArray,
     output: str = "measured_displacement", *, step: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, float]:  # fmt: skip
-    """Return what an effect adds (n,) along the course and by a simulation, and the error told."""
+    """Return what an effect adds (n,) along the course and in a simulation, and the error."""
     model = base.with_effect(effect).with_values({effect.gain or "": step})
     law = law_of(model.structure, effect)
     assert law is not None
@@ -33,7 +33,7 @@ def _both(
         opened(base, [law]), law, model, course, u, start,
         finite=step != 0.0, way=_WAY, outputs=[output],
     )  # fmt: skip
-    begin = begun(model, t, u, start)
+    begin = start_for(model, t, u, start)
     column = model.parameter_names.index(effect.gain or "")
     whole = trace(
         model, t, u, begin.x, way=_WAY, outputs=[output], unknowns=[effect.gain or ""],
@@ -58,7 +58,7 @@ def _drive() -> tuple[FloatArray, FloatArray]:
 
 
 def _shown(model: Model, t: FloatArray, u: FloatArray) -> FloatArray:
-    x0 = begun(model, t, u, {}).x
+    x0 = start_for(model, t, u, {}).x
     return trace(model, t, u, x0, way=_WAY, outputs=["measured_displacement"]).y[:, 0]
 
 
@@ -87,7 +87,7 @@ def test_finite_gains_are_those_of_the_whole_model(name: str, size: float) -> No
     assert np.std(added - simulated) < max(5e-3, error) * effect
 
 
-def test_steps_that_the_samples_do_not_show_are_told() -> None:
+def test_steps_that_the_samples_do_not_show_raise_the_error() -> None:
     """Self-heating by the voltage's way within a sample, and a lag of a millisecond."""
     t = np.linspace(0.0, 2.0, 201)
     steps = 50.0 + 30.0 * np.sign(np.sin(2 * np.pi * 3.0 * t))

@@ -29,6 +29,7 @@ from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
+from psa_casadi.display import with_units
 from psa_casadi.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import note
@@ -36,7 +37,6 @@ from psa_casadi.progress import Progress, silent
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
-from psa_casadi.shown import with_units
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.units import FloatArray
 

@@ -31,7 +31,7 @@ from psa_casadi.model.ports import Opened, ported
 from psa_casadi.processes import Processes
 from psa_casadi.simulation.exact.split import closure, dependence
 from psa_casadi.simulation.side_by_side import threads
-from psa_casadi.simulation.start import begun
+from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError, Steps, run
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
@@ -117,19 +117,19 @@ class Played:
         """Run a model with this FMU in it; see `stepper.run`.
 
         States are those of effects. They begin as far from rest as `x0` is from the rest that
-        `begun` finds without the FMU, whatever `s0` is.
+        `start_for` finds without the FMU, whatever `s0` is.
         """
         item = dict(values or model.values)
         inner = inner_of(model).with_values(item)
         items = list(model.output_names if outputs is None else outputs)
-        away, names = x0 - begun(model, t, u, {}).x, inner.output_names
+        away, names = x0 - start_for(model, t, u, {}).x, inner.output_names
         states = dict(zip(model.state_names, away.tolist(), strict=True))
         count, inputs = len(unknowns), [_GIVEN + n for n in model.input_names]
 
         def around(y: FloatArray, texts: Sequence[str], by: Sequence[str | int]) -> Steps:
             """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
             whole = np.hstack([u, y])
-            begin = begun(inner, t, whole, states)
+            begin = start_for(inner, t, whole, states)
             columns = [
                 begin.by_parameter[:, inner.parameter_names.index(q)]
                 if isinstance(q, str)

@@ -20,10 +20,10 @@ from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Traced, Way, record_inputs, trace
 from psa_casadi.simulation.start import (
-    begun,
     initial_slope,
     memory_names,
     settling_time,
+    start_for,
     start_state,
 )
 from psa_casadi.units import FloatArray
@@ -79,7 +79,7 @@ def predict_record(
 def record_start(model: Model, record: Record, start: Mapping[str, float]) -> FloatArray:
     """Return the states (nx,) at a record's first sample; `start` as in `predict_record`."""
     time, u = record.time - record.time[0], record_inputs(model, record, record.n)
-    return begun(model, time, u, start).x
+    return start_for(model, time, u, start).x
 
 
 def trace_record(
@@ -98,7 +98,7 @@ def trace_record(
     By `wanted` (n, m, k) alone without `by_start`.
     """
     t, u = record.time[:stop] - record.time[0], record_inputs(model, record, stop)
-    begin = begun(model, t, u, start)
+    begin = start_for(model, t, u, start)
     s0 = begin.by_parameter[:, [model.parameter_names.index(n) for n in wanted]]
     unknowns: list[str | int] = list(wanted)
     if by_start:

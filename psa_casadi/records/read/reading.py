@@ -21,6 +21,7 @@ import numpy.typing as npt
 from numpy.typing import ArrayLike
 
 from psa_casadi.characters import plain
+from psa_casadi.display import with_units
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.records.read import apart
@@ -47,7 +48,6 @@ from psa_casadi.records.read.table import (
 )
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.signals import Hold, Signals
-from psa_casadi.shown import with_units
 from psa_casadi.units import FloatArray, parse_unit, to_si
 
 

@@ -23,6 +23,7 @@ from psa_casadi.diagnosis.result import (
     Verdict,
     unnamed_causes,
 )
+from psa_casadi.display import Lined
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.check import CheckReport
 from psa_casadi.identification.identify import StackIdentification
@@ -32,8 +33,7 @@ from psa_casadi.notes import Note
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.report.words.fit_words import Degree, grade
-from psa_casadi.shown import Lined
-from psa_casadi.strict_json import decode, read_json, shown
+from psa_casadi.strict_json import brief, decode, read_json
 from psa_casadi.version import __version__
 
 CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
@@ -583,7 +583,7 @@ def load_diagnosis(path: str | os.PathLike[str]) -> DiagnosisFile | OwnModelFile
     content = read_json(source, f"{_READ_ADVICE}.")
     diagnosis, kind = diagnosis_in(content, source)
     if diagnosis is None:
-        raise InputError(f"{source}: its format is {shown(kind)}, no diagnosis; {_READ_ADVICE}.")
+        raise InputError(f"{source}: its format is {brief(kind)}, no diagnosis; {_READ_ADVICE}.")
     return diagnosis
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 from psa_casadi.component import Component
+from psa_casadi.display import frame
 from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write
 from psa_casadi.population.finding import Finding
@@ -19,7 +20,6 @@ from psa_casadi.report.words import population_words as words
 from psa_casadi.report.words.phrases import number, one_unit
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
-from psa_casadi.shown import frame
 
 #: More devices than this are a population.
 MOST = 20

@@ -13,7 +13,7 @@ from psa_casadi.units import BoolArray
 
 _GIVEN = "real t, const real *x, const real *v, real w, const real *k, real *out"
 _OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"
-#: Rows whose sums stand in the processor's registers together, beside what they are made of.
+#: Rows whose sums fit in the processor's registers together with their terms.
 CHUNK = 8
 
 
@@ -27,7 +27,7 @@ class Entry:
 
 
 def dispatch(name: str, count: int, text: str = _GIVEN) -> str:
-    """Return a function that calls the one with the number it is given."""
+    """Return a function that calls the one with the number `which`."""
     passed = [q.split()[-1].lstrip("*") for q in text.split(",")]
     unused = ", ".join(f"(void){q}" for q in passed)
     calls = ", ".join(passed)
@@ -62,22 +62,22 @@ def chains(name: str, texts: Sequence[str]) -> str:
 
 
 def sensitive(text: str) -> str:
-    """Return text that stands only where there are derivatives: not with lanes nor on a GPU."""
+    """Return text that is compiled only with derivatives: not with lanes nor on a GPU."""
     return f"#if PSA_SENSITIVE\n{text}#endif\n"
 
 
 def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int]) -> str:
     """Return what the linear part does to columns x, and its matrices' own derivatives, as C.
 
-    Rows are those of the whole step and then those `needed` inside it; `reach` says which entries
-    of a row are not zero, `linear` which state each is of.
+    Rows are those of the whole step and then those `needed` inside it; `reach` marks the entries
+    of a row that are not zero, `linear` which state each is of.
 
         out = x + F x: F by columns `f`, and by the rows `half` of the half of the step
         out += dF l + the other matrices' derivatives times the tail, a chunk of rows a time
 
     `d` holds for each chunk the tail's factors, then those of L by its columns.
     """
-    rows, product, item = [*range(len(linear)), *needed], [], []
+    rows, product, derivatives = [*range(len(linear)), *needed], [], []
     for place, i in enumerate(rows):
         inside = place - len(linear)
         factors = [
@@ -89,17 +89,17 @@ def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int
     for first in range(0, len(rows), CHUNK):
         chunk = range(first, min(first + CHUNK, len(rows)))
         entries = [(r, j) for j in range(len(reach)) for r in chunk if reach[rows[r], j]]
-        item += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
-        item += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
-        item += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
-        item += ["        }"]
-        item += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
-        item += [f"        d += {len(entries)};"]
-        item += [*(f"        out[{r}] += a{r};" for r in chunk), "    }"]
+        derivatives += ["    {", *(f"        column a{r} = {{0.0}};" for r in chunk)]
+        derivatives += [f"        for (int k = 0; k < tails; ++k, d += {len(chunk)}) {{"]
+        derivatives += [f"            a{r} += tail[k] * d[{r - first}];" for r in chunk]
+        derivatives += ["        }"]
+        derivatives += [f"        a{r} += l[{j}] * d[{k}];" for k, (r, j) in enumerate(entries)]
+        derivatives += [f"        d += {len(entries)};"]
+        derivatives += [*(f"        out[{r}] += a{r};" for r in chunk), "    }"]
     text = "const real *f, const real *const *half, const column *x, column *out"
     last = "const real *l, const double *tail, int tails, const column *d, column *out"
     lines = [f"static inline void ex_linear_columns({text}) {{", "    (void)half;", *product, "}"]
-    lines += [f"static inline void ex_own_columns({last}) {{", *item, "}"]
+    lines += [f"static inline void ex_own_columns({last}) {{", *derivatives, "}"]
     return sensitive("\n".join([*lines, ""]))
 
 
@@ -121,12 +121,12 @@ def generate(split: Split, outputs: Sequence[str]) -> str:
     group_size, rate_size = _groups(split, printer, rate)
     port_size = _ports(split, printer, tables)
     names = [o.name for o in s.outputs]
-    displayed = [s.y[names.index(n)] for n in outputs]
-    partials, entries = _partials(split, displayed, None)
+    requested = [s.y[names.index(n)] for n in outputs]
+    partials, entries = _partials(split, requested, None)
     printer.function("ex_outputs", [s.y])
-    printer.function("ex_shown", displayed)
-    printer.function("ex_shown_slopes", [*displayed, *partials])
-    rule = chain("ex_shown_chain_0", entries, len(displayed))
+    printer.function("ex_shown", requested)
+    printer.function("ex_shown_slopes", [*requested, *partials])
+    rule = chain("ex_shown_chain_0", entries, len(requested))
     printer.functions.append(chains("ex_shown_chain", [rule]))
     kept, prepare = printer.kept()
     place = {state: k for k, state in enumerate(split.linear)}
@@ -138,8 +138,8 @@ def generate(split: Split, outputs: Sequence[str]) -> str:
         "EX_NP": len(s.parameters), "EX_NY": len(s.outputs), "EX_NG": len(split.groups),
         "EX_NPORT": len(split.ports), "EX_NCH": len(chords), "EX_NTHETA": len(thetas),
         "EX_NK": kept, "EX_NITEMS": len(split.order), "EX_GROUP_OUT": group_size,
-        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_NSHOWN": len(displayed),
-        "EX_SHOWN_OUT": len(displayed) + len(entries), "EX_NRATED": printer.rated,
+        "EX_PORT_OUT": port_size, "EX_RATE_OUT": rate_size, "EX_NSHOWN": len(requested),
+        "EX_SHOWN_OUT": len(requested) + len(entries), "EX_NRATED": printer.rated,
         "EX_CONSTANT": int(not c.is_zero()),
         "EX_NLOOP": sum(kind == "loop" for kind, _ in split.order),
     }  # fmt: skip

@@ -11,6 +11,7 @@ from typing import Any
 import casadi as ca
 
 from psa_casadi.component import Expression
+from psa_casadi.symbolic import instructions
 
 #: (operation, arguments) or ("x", index), ("c", value), ...; equal nodes are one number.
 Node = tuple[Any, ...]
@@ -90,7 +91,7 @@ class Graph:
         if op in simple:
             return simple[op]()
         if op == ca.OP_LOG and ("v_log_of_base", one) in self.numbers:
-            return self.add("v_log_of_base", one)  # beside a power of the same base
+            return self.add("v_log_of_base", one)  # as a power has the same base
         if op in _CALLS:
             return self.add(_CALLS[op], *arguments)
         raise Unprintable(f"operation {op}")
@@ -102,20 +103,15 @@ class Graph:
         function = ca.Function("f", list(arguments.values()), whole)
         slots: dict[int, int] = {}
         numbers = [0] * function.numel_out(0)
-        for k in range(function.n_instructions()):
-            op = function.instruction_id(k)
-            if op == ca.OP_CONST:
-                slots[function.instruction_output(k)[0]] = self.constant(
-                    function.instruction_constant(k)
-                )
+        for op, inputs, targets in instructions(function):
+            if op == ca.OP_OUTPUT:
+                numbers[targets[1]] = slots[inputs[0]]
+            elif op == ca.OP_CONST:
+                slots[targets[0]] = self.constant(inputs[0])
             elif op == ca.OP_INPUT:
-                argument, element = function.instruction_input(k)
-                slots[function.instruction_output(k)[0]] = self.add(names[argument], element)
-            elif op == ca.OP_OUTPUT:
-                numbers[function.instruction_output(k)[1]] = slots[function.instruction_input(k)[0]]
+                slots[targets[0]] = self.add(names[inputs[0]], inputs[1])
             else:
-                items = [slots[a] for a in function.instruction_input(k)]
-                slots[function.instruction_output(k)[0]] = self.operation(op, *items)
+                slots[targets[0]] = self.operation(op, *(slots[a] for a in inputs))
         return numbers
 
     def _times(self, a: int, b: int) -> int:
@@ -200,7 +196,7 @@ class Printer:
         self._graph = Graph()
         self._kept: dict[int, int] = {}
         self._rated: dict[int, int] = {}
-        self._own_rated: list[int] = []
+        self._new_rated: list[int] = []
         self.functions: list[str] = []
 
     def function(self, name: str, outputs: Sequence[Expression]) -> None:
@@ -231,11 +227,11 @@ class Printer:
     def of_rate(self, name: str) -> None:
         """Print `static void name(w, k)`: what the functions since the last call read of the rate.
 
-        It stands in `k` behind what depends on the parameters alone.
+        In `k` it follows what depends on the parameters alone.
         """
-        item, self._own_rated = self._own_rated, []
-        lines = self._body(item, fixed=False, rated=True)
-        lines += [f"    k[EX_NK + {self._rated[n]}] = s{n};" for n in item]
+        numbers, self._new_rated = self._new_rated, []
+        lines = self._body(numbers, fixed=False, rated=True)
+        lines += [f"    k[EX_NK + {self._rated[n]}] = s{n};" for n in numbers]
         head = f"static inline void {name}(real w, real *k) {{"
         self.functions.append("\n".join([head, "    (void)w, (void)k;", *lines, "}", ""]))
 
@@ -281,8 +277,8 @@ class Printer:
         """Return how a varying function reads a node; what needs no state it reads from k."""
         leaf = self._graph.nodes[number][0] in LEAVES
         if self._graph.rated[number] and not (self._graph.fixed[number] or leaf):
-            if number not in self._own_rated:
-                self._own_rated.append(number)
+            if number not in self._new_rated:
+                self._new_rated.append(number)
             return f"k[EX_NK + {self._rated.setdefault(number, len(self._rated))}]"
         return self._rate_name(number)
 

@@ -25,7 +25,7 @@ from psa_casadi.simulation.timings import count_run, count_steps
 from psa_casadi.symbolic import in_turn
 from psa_casadi.units import FloatArray
 
-#: A sample is halved so many times at most; what then misses the tolerance is counted as forced.
+#: A sample is halved this many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12
 #: Sets of parameters that run side by side in the vectors of one core.
 LANES = 4
@@ -33,7 +33,8 @@ LANES = 4
 #: takes the time of 10 to 60 of them for a sample: at this tolerance of a step, and as its root
 #: below. A set in lanes has no other way.
 MOST, AT, MOST_IN_LANES = 60, 1e-6, 100_000
-#: Time steps that differ by less than this share count as one, and so many may differ by more.
+#: Time steps that differ by less than this share count as one, and LENGTHS of them may differ by
+#: more.
 ALIKE, LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
 _FLAGS = ("-std=gnu99", "-fno-math-errno")
@@ -46,7 +47,7 @@ _STOPPED = 4
 
 
 class NotExact(Exception):  # noqa: N818 - the stepper is taken instead, which is no mistake
-    """A run that exact steps do not do; the message says why."""
+    """A run that exact steps do not do; the message gives the reason."""
 
 
 class _Request(ctypes.Structure):
@@ -66,13 +67,13 @@ class _Request(ctypes.Structure):
 
 @dataclass(frozen=True)
 class ExactSteps:
-    """What a run returned: asked outputs `shown` (n, m), their derivatives `sensitivity` (n, m, k).
+    """What a run returns: outputs `requested` (n, m), their derivatives `sensitivity` (n, m, k).
 
-    `x` (n, nx) and `y` (n, ny) are all states and outputs, without rows where they were not asked
-    for. `forced` steps missed the tolerance at the finest length.
+    `x` (n, nx) and `y` (n, ny) are all states and outputs, without rows if the run is not for
+    `everything`. `forced` steps missed the tolerance at the finest length.
     """
 
-    shown: FloatArray
+    requested: FloatArray
     sensitivity: FloatArray
     x: FloatArray
     y: FloatArray
@@ -169,7 +170,7 @@ def run_exact(
     `tolerance` bounds the estimated error of a step, over the states' `error_sizes`; every sample
     is divided by 2^coarsest at least. `unknowns` and `s0` are those of the stepper's `run`;
     `everything` asks for all states and outputs. Raises NotExact where this way is not possible,
-    where it fails, or where it needs so many steps that the stepper is no slower.
+    where it fails, or where the stepper would be no slower.
     """
     n, nx, m, count = len(t), len(model.state_names), len(outputs), len(unknowns)
     arrays: dict[str, npt.NDArray[Any]] = {

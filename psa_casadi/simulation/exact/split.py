@@ -21,7 +21,7 @@ import numpy as np
 
 from psa_casadi.component import Expression
 from psa_casadi.model.structure import Structure
-from psa_casadi.symbolic import in_turn
+from psa_casadi.symbolic import in_turn, instructions
 from psa_casadi.units import BoolArray
 
 
@@ -52,7 +52,7 @@ def others(s: Structure, i: int) -> Iterable[int]:
 class Group:
     """States along the path of one driver, by their indices in the model's state vector.
 
-    `rate` is the symbol that stands for the driver's rate in `slopes`, the states' derivatives.
+    `rate` is the symbol of the driver's rate in `slopes`, the states' derivatives.
     """
 
     driver: int
@@ -75,14 +75,12 @@ def along(s: Structure, i: int, reach: BoolArray) -> tuple[int, Expression, Expr
         keep = {name} if name in s.balances else set()
         slope = _resolved(s, s.der[s.states[i].name], keep)
         slope = ca.substitute(slope, s.symbols[name], rate)
-        if ca.depends_on(slope, s.time):
-            continue
-        if not ca.depends_on(slope, rate):
+        if ca.depends_on(slope, s.time) or not ca.depends_on(slope, rate):
             continue
         resting = ca.substitute(slope, rate, ca.SX(0))
         everything = ca.vertcat(s.x[list(others(s, i))], s.u, s.time)
-        item = ca.jacobian(resting, s.x[i])
-        if not ca.depends_on(resting, everything) and not ca.depends_on(item, s.x[i]):
+        decay = ca.jacobian(resting, s.x[i])
+        if not ca.depends_on(resting, everything) and not ca.depends_on(decay, s.x[i]):
             return driver, rate, slope
     return None
 
@@ -118,8 +116,8 @@ def groups_along(table: Mapping[int, tuple[int, Expression, Expression]]) -> tup
 Item = tuple[str, tuple[int, ...]]
 
 
-class NoSplit(Exception):  # noqa: N818 - it says that a form does not fit, which is no mistake
-    """The model does not have the form of exact steps; the message says why."""
+class NoSplit(Exception):  # noqa: N818 - a form that does not fit is no mistake
+    """The model does not have the form of exact steps; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -152,12 +150,12 @@ def order_of(
     for kind, members in items:
         if kind == "group":
             group = groups[members[0]]
-            inside, item = np.any(dependence(group.slopes, s.x), axis=0), list(group.states)
-            read = [*(j for j in np.flatnonzero(inside).tolist() if j not in item), group.driver]
+            inside, fed = np.any(dependence(group.slopes, s.x), axis=0), list(group.states)
+            read = [*(j for j in np.flatnonzero(inside).tolist() if j not in fed), group.driver]
         else:
             inside = np.any([dependence(ports[k].value, s.x)[0] for k in members], axis=0)
-            item, read = [ports[k].state for k in members], np.flatnonzero(inside).tolist()
-        feeds.append(item)
+            fed, read = [ports[k].state for k in members], np.flatnonzero(inside).tolist()
+        feeds.append(fed)
         reads.append(read)
     waiting, done = list(range(len(items))), []
     while waiting:
@@ -206,7 +204,7 @@ class Split:
 @cache
 @in_turn
 def split_of(structure: Structure) -> Split | str:
-    """Return how a model splits, or a sentence that says why it does not."""
+    """Return how a model splits, or the reason why it does not, a sentence."""
     try:
         return _split(structure)
     except NoSplit as reason:
@@ -245,20 +243,20 @@ def _split(s: Structure) -> Split:
 def jumping(s: Structure, of: Expression) -> set[tuple[int, int]]:
     """Return what operations that jump read: the argument of the equations, and its element.
 
-    Slopes do not tell that anything depends on these. Of equations without sampled states.
+    Derivatives do not show what depends on these. Of equations without sampled states.
     """
     equations = ca.Function("f", s.arguments, [of])
     reads: dict[int, set[tuple[int, int]]] = {}
     result: set[tuple[int, int]] = set()
-    for k in range(equations.n_instructions()):
-        op, inputs = equations.instruction_id(k), equations.instruction_input(k)
+    for op, inputs, targets in instructions(equations):
+        if op == ca.OP_OUTPUT:
+            continue
         if op == ca.OP_INPUT:
             read = {(inputs[0], inputs[1])}
         else:
-            read = set() if op == ca.OP_OUTPUT else set().union(*(reads[q] for q in inputs))
+            read = set().union(*(reads[q] for q in inputs if op != ca.OP_CONST))
         result |= read if op in _JUMPS else set()
-        for slot in equations.instruction_output(k) if op != ca.OP_OUTPUT else ():
-            reads[slot] = read
+        reads |= dict.fromkeys(targets, read)
     return result
 
 

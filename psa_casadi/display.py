@@ -1,7 +1,7 @@
-"""What results show of themselves: how is made by the reports, which stand above them."""
+"""What results show of themselves; the reports, in layers above, make it and load when used."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
 
@@ -9,22 +9,23 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_make: Callable[..., Any]
-
-
-def register(make: Callable[..., Any]) -> None:
-    """Register what makes a text, a picture or a page of a result, by the name of its function."""
-    global _make  # noqa: PLW0603 - one function for all results
-    _make = make
+#: Modules of functions that make texts, which need no pictures; all others are in `report.shown`.
+_TEXTS = {
+    "note_text": "psa_casadi.report.words.notes",
+    "told": "psa_casadi.report.words.text",
+    "sentence_of": "psa_casadi.report.words.advice_words",
+    "identification_file": "psa_casadi.report.documents.files",
+}
 
 
 def made(what: str, *inputs: Any, **options: Any) -> Any:
-    """Return what the registered function makes: "line", "plot", "note_text", ..."""
-    return _make(what, *inputs, **options)
+    """Return what a function of the reports makes, by its name: "line", "plot", "note_text", ..."""
+    module = import_module(_TEXTS.get(what, "psa_casadi.report.shown"))
+    return getattr(module, what)(*inputs, **options)
 
 
 class Worded:
-    """What says itself in a sentence."""
+    """A result with a sentence in words."""
 
     @property
     def sentence(self) -> str:
@@ -63,11 +64,7 @@ class Lined(Celled):
         return str(made("line", self))
 
 
-class Shown(Plotted, Lined):
-    """What a result can show of itself: a line, a notebook's cell, a picture."""
-
-
-class Reported(Shown):
+class Reported(Plotted, Lined):
     """What a result can show of itself that has a page of its own."""
 
     def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
