@@ -44,8 +44,7 @@ if TYPE_CHECKING:
     from psa_casadi.export.extended import export_extended
     from psa_casadi.export.fixed_step.export import CodeExport, export_c
     from psa_casadi.export.fmu.archive import export_fmu
-    from psa_casadi.export.importer.fmu_model import fmu_model
-    from psa_casadi.export.importer.model_with_fmu import load_model
+    from psa_casadi.export.importer.fmu_model import fmu_model, load_model
     from psa_casadi.export.importer.start_values import save_start_values
     from psa_casadi.export.modelica.package import export_modelica
     from psa_casadi.export.ssp import export_ssp
@@ -123,7 +122,6 @@ _HOMES = {
     "model.nanopositioner": "controller_for margins_of nanopositioner",
     "model.ode_model": "ode_model",
     "model.table": "table",
-    "export.importer.model_with_fmu": "load_model",
     "model.model_file": "save_model",
     "design.linear": "Linear linearize margins observer",
     "design.mechanism.mechanism": "design_mechanism mechanism_model port_model",
@@ -150,7 +148,7 @@ _HOMES = {
     "export.fmu.archive": "export_fmu",
     "export.modelica.package": "export_modelica",
     "export.ssp": "export_ssp",
-    "export.importer.fmu_model": "fmu_model",
+    "export.importer.fmu_model": "fmu_model load_model",
     "export.importer.start_values": "save_start_values",
     "export.extended": "export_extended",
     "export.check.check": "CheckReport check_fmu",

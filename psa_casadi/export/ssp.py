@@ -507,23 +507,32 @@ def export_ssp(
             for name, part in wiring.parts.items()
         }
         wiring = replace(wiring, parts=parts, publication=publication)
-    layout = layout_of(wiring)
-    entries, bindings = parameter_files(wiring.parts, wiring.name)
-    description = structure_description(
-        wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
-    )
-    entries["SystemStructure.ssd"] = description.encode("utf-8")
-    entries[PICTURE_ENTRY] = wiring_picture(wiring, layout, "svg")
+    files, bindings = parameter_files(wiring.parts, wiring.name)
+    entries = system_entries(wiring, bindings, stop_time, master_step(wiring, stop_time)) | files
     with temporary_folder() as folder:
         for name, model in wiring.parts.items():
-            fmu = export_fmu(
-                model, folder / f"{name}.fmu", name=name, include_sensor=True,
-                platforms=platforms,
-            )  # fmt: skip
-            entries[f"resources/{name}.fmu"] = fmu.read_bytes()
+            entries[f"resources/{name}.fmu"] = part_fmu(model, name, folder, platforms).read_bytes()
     with atomic_path(path) as temporary:
         write_archive(temporary, entries)
     return Path(path)
+
+
+def system_entries(
+    wiring: WiredParts, bindings: Sequence[Binding], stop_time: float, step: float
+) -> dict[str, bytes]:
+    """Return the description of a system and the picture of its wiring by place in the archive."""
+    layout = layout_of(wiring)
+    text = structure_description(wiring, layout, bindings, stop_time, step)
+    return {
+        "SystemStructure.ssd": text.encode("utf-8"),
+        PICTURE_ENTRY: wiring_picture(wiring, layout, "svg"),
+    }
+
+
+def part_fmu(model: Model, name: str, folder: Path, platforms: Sequence[str]) -> Path:
+    """Write the FMU of a part into a folder and return its path."""
+    path = folder / f"{name}.fmu"
+    return export_fmu(model, path, name=name, include_sensor=True, platforms=platforms)
 
 
 def wiring_of(system: System) -> WiredParts:

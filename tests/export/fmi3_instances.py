@@ -92,17 +92,17 @@ class Instance3(importer.Instance):
 
     def serialized(self) -> bytes:
         """Return the instance's state as bytes."""
-        snapshot = self.save()
-        data = self.serialize(snapshot)
-        self.drop(snapshot)
+        snapshot = self.fmi.getFMUState()
+        data: bytes = self.fmi.serializeFMUState(snapshot)
+        self.fmi.freeFMUState(snapshot)
         return data
 
     def try_restore(self, data: bytes) -> int:
         """Go to a state given as bytes; return the status of the first call that fails."""
         try:
-            snapshot = self.deserialize(data)
+            snapshot = self.fmi.deserializeFMUState(data)
         except importer.FmuError as error:
             return error.status
         status = self.call("SetFMUState", snapshot)
-        self.drop(snapshot)
+        self.fmi.freeFMUState(snapshot)
         return status

@@ -43,7 +43,7 @@ from psa_casadi.export.fmu.reference_run import (
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.fmu import Signals
 from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError

@@ -56,7 +56,7 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
     with Fmu(exported(STACK, fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
         slave.set({"voltage": 50.0})
         slave.step(0.0, 1e-3)
-        snapshot, reached = slave.save(), ctypes.c_double()
+        snapshot, reached = slave.fmi.getFMUState(), ctypes.c_double()
         slave.set({"voltage": 1e300})
         if fmi == 2:
             assert slave.call("DoStep", 1e-3, 1e-3, 1) == DISCARD
@@ -75,8 +75,8 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
         with pytest.raises(FmuError) as refused:
             slave.step(reached.value, 1e-3)
         assert refused.value.status == ERROR
-        slave.restore(snapshot)
-        slave.drop(snapshot)
+        slave.fmi.setFMUState(snapshot)
+        slave.fmi.freeFMUState(snapshot)
         assert snapshot.value is None
         slave.set({"voltage": 60.0})
         slave.step(1e-3, 1e-3)
@@ -386,9 +386,9 @@ def _saved(instance: Instance, moved: str) -> bytes:
     """Return the state after a step, as bytes."""
     instance.set({moved: 5.0})
     instance.step(0.0, 1e-3)
-    snapshot = instance.save()
-    data = instance.serialize(snapshot)
-    instance.drop(snapshot)
+    snapshot = instance.fmi.getFMUState()
+    data: bytes = instance.fmi.serializeFMUState(snapshot)
+    instance.fmi.freeFMUState(snapshot)
     return data
 
 
@@ -420,17 +420,17 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
             for content in WORDS:
                 begin = time.monotonic()
                 try:
-                    snapshot = instance.deserialize(_forged(data, word, content))
+                    snapshot = instance.fmi.deserializeFMUState(_forged(data, word, content))
                 except FmuError as refusal:
                     refused[word, content] = refusal.status
                     continue
-                instance.restore(snapshot)
-                instance.drop(snapshot)
+                instance.fmi.setFMUState(snapshot)
+                instance.fmi.freeFMUState(snapshot)
                 statement.add(_use(instance, moved))
                 slowest = max(slowest, time.monotonic() - begin)
-        snapshot = instance.deserialize(data)
-        instance.restore(snapshot)
-        instance.drop(snapshot)
+        snapshot = instance.fmi.deserializeFMUState(data)
+        instance.fmi.setFMUState(snapshot)
+        instance.fmi.freeFMUState(snapshot)
         instance.step(1e-3, 1e-3)
     states = range(3, 3 + len(fmu.states()))
     assert {(w, c) for w in states for c in (WORDS[0], WORDS[3])} <= set(refused)
@@ -445,12 +445,12 @@ def test_a_forged_parameter_is_named(either: Instance) -> None:
     data = _saved(either, "voltage")
     place = data.index(struct.pack("<d", kept), STAMP) - STAMP
     with pytest.raises(FmuError, match="altered: m_B cannot be"):
-        either.deserialize(_forged(data, place // 8, struct.pack("<d", -kept)))
+        either.fmi.deserializeFMUState(_forged(data, place // 8, struct.pack("<d", -kept)))
 
 
 def test_a_snapshot_that_frees_itself(either: Instance) -> None:
     """Some importers pass the snapshot where its address is asked for; reference FMUs bear it."""
-    snapshot = either.save()
+    snapshot = either.fmi.getFMUState()
     word = "FMUstate" if either.fmu.version == 2 else "FMUState"
     assert (
         getattr(either.fmu.library, f"fmi{either.fmu.version}Free{word}")(
@@ -460,9 +460,9 @@ def test_a_snapshot_that_frees_itself(either: Instance) -> None:
     )
     either.set({"voltage": 20.0})
     either.step(0.0, 1e-3)
-    either.restore(snapshot)  # nothing was freed, nothing written
+    either.fmi.setFMUState(snapshot)  # nothing was freed, nothing written
     assert either.get(["time", "voltage"]) == pytest.approx([0.0, 0.0])
-    either.drop(snapshot)
+    either.fmi.freeFMUState(snapshot)
     assert snapshot.value is None
 
 

@@ -21,9 +21,9 @@ from psa_casadi.export.importer.fmu import (
     Fmu,
     FmuError,
     Instance,
+    Signals,
 )
 from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
 from psa_casadi.units import FloatArray
 from tests.export.fmi3_instances import Instance3, loaded
 from tests.export.fmu_models import entries, exported, model_named
@@ -283,19 +283,19 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
     with Fmu(exported(STACK, fmi)) as fmu:
         with fmu.start(CO_SIMULATION, values={"input_line": 1.0}) as slave:
             _run(slave, 100, end=10)
-            snapshot = slave.save()
-            data = slave.serialize(snapshot)
+            snapshot = slave.fmi.getFMUState()
+            data = slave.fmi.serializeFMUState(snapshot)
             first = _run(slave, 100, first=10, end=20)
-            slave.restore(snapshot)
-            slave.drop(snapshot)
+            slave.fmi.setFMUState(snapshot)
+            slave.fmi.freeFMUState(snapshot)
             assert np.array_equal(_run(slave, 100, first=10, end=20), first)
             slave.require("Reset")
             slave.setup()
             assert slave.get(["input_line"])[0] == 0.0
         with fmu.open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
+            copy = other.fmi.deserializeFMUState(data)
+            other.fmi.setFMUState(copy)
+            other.fmi.freeFMUState(copy)
             assert np.array_equal(_run(other, 100, first=10, end=20), first)
             with pytest.raises(FmuError, match="'input_line' can be set only before the first"):
                 other.set({"input_line": 0.0})

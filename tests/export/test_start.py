@@ -16,9 +16,15 @@ from psa_casadi.export.check.structure import wrong_start
 from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    Fmu,
+    FmuError,
+    Instance,
+    Signals,
+)
 from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state
@@ -370,15 +376,15 @@ def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> 
             slave.set({START_VOLTAGE: voltage})
             assert apart(fmu, slave, settled(model, voltage) | {"voltage": voltage}) < 1e-8
             assert slave.get(["displacement"])[0] == slave.get(["x"])[0]
-        snapshot = slave.save()
-        copy = slave.serialize(snapshot)
+        snapshot = slave.fmi.getFMUState()
+        copy = slave.fmi.serializeFMUState(snapshot)
         slave.set({START_VOLTAGE: 0.0})
         assert apart(fmu, slave, dict.fromkeys((*model.state_names, "voltage"), 0.0)) == 0.0
-        back = slave.deserialize(copy)
-        slave.restore(back)
+        back = slave.fmi.deserializeFMUState(copy)
+        slave.fmi.setFMUState(back)
         assert apart(fmu, slave, settled(model, 25.0)) < 1e-8
         for data in (snapshot, back):
-            slave.drop(data)
+            slave.fmi.freeFMUState(data)
         slave.require("ExitInitializationMode")
         with pytest.raises(FmuError, match="'start_voltage' can be set only before"):
             slave.set({START_VOLTAGE: 10.0})

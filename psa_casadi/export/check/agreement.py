@@ -13,11 +13,11 @@ import numpy as np
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import BREAKDOWNS
-from psa_casadi.export.common.markup import time_scale
 from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, played_inputs, shown_output
+from psa_casadi.export.fmu import reference_run
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.fmu import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.simulate import settled_at
@@ -84,16 +84,15 @@ _TOLERANCE = 1e-10
 _SLOW_STEPS = (1e-2, 1e-3, 1e-4)
 _MOST_STEPS = 6000
 _FAST_STEP, _FAST_COUNT = 1e-6, 3000
-_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 
 
 def signals_of(model: Model, segment: float) -> Signals:
     """Return a test signal: six straight segments [s each] from 0 up to every input's nominal."""
-    times = np.array([segment * k for k in range(len(_SHAPE))])
-    columns = []
-    for i, declared in enumerate(model.structure.inputs):
-        shape = np.roll(_SHAPE[1:], 2 * i)
-        columns.append(nominal_value(declared.nominal, model.values) * np.array([0.0, *shape]))
+    times = np.array([segment * k for k in range(len(reference_run.SHAPE))])
+    columns = [
+        nominal_value(declared.nominal, model.values) * reference_run.shifted(i)
+        for i, declared in enumerate(model.structure.inputs)
+    ]
     return Signals(model.input_names, times, np.array(columns).T.reshape(len(times), -1))
 
 
@@ -199,8 +198,7 @@ def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
     of FMI 3.0, which has no input derivatives, they are held. The scale is the range of each output
     in the slow run; that of other outputs than displacement is at least their nominal.
     """
-    segment = 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
-    slow, fast = signals_of(model, segment), signals_of(model, 5e-4)
+    slow, fast = signals_of(model, reference_run.segment(model)), signals_of(model, 5e-4)
     grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
     times = np.unique(np.concatenate([*grids.values(), slow.times]))
     linear = expected_outputs(model, times, slow)

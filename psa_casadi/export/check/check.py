@@ -124,7 +124,10 @@ def check_fmu(
     chosen: list[Model] = [model] if model else []
     end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
-        if _is_foreign(archive, foreign, model):
+        if foreign is None:
+            tool = str(archive.description.generationTool)
+            foreign = model is None and not tool.startswith("psa_casadi")
+        if foreign:
             rows += [c.row() for c in described(archive, description.invalid)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
             rows += rows_apart(task, end)
@@ -167,12 +170,6 @@ def _demand_zip(path: Path) -> None:
         raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
 
 
-def _is_foreign(archive: Archive, wanted: bool | None, model: Model | None) -> bool:
-    if wanted is not None:
-        return wanted
-    return model is None and not str(archive.description.generationTool).startswith("psa_casadi")
-
-
 def _described(
     archive: Archive, chosen: list[Model], effects: tuple[Component, ...]
 ) -> Iterator[Check]:
@@ -208,17 +205,17 @@ def _described(
 def as_exported(archive: Archive, model: Model) -> Model:
     """Return the model as the exporter took it: whole, or without sensor and environment.
 
-    And with the output that tells how far a run is outside of what the records have shown. That
-    sensor and environment are left out is told by all their variables: a sensor's effect need not
-    have an output of its own.
+    With the output for how far a run is outside of the records' range, where the FMU has it. Sensor
+    and environment are left out where all their variables are missing: a sensor's effect need not
+    have an output.
     """
     inside, apart = (
         {v.name for c in model.components if c.in_plant is plant for v in _variables(c)}
         for plant in (True, False)
     )
-    item = apart - inside  # what only sensor and environment have
-    described = {v.name for v in archive.description.modelVariables}
-    exported = model.plant() if item and item.isdisjoint(described) else model
+    outside = apart - inside  # variables of sensor and environment alone
+    without = outside and outside.isdisjoint(archive.references)
+    exported = model.plant() if without else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
     return description.published_as(archive, exported)

@@ -1,7 +1,7 @@
 """What modelDescription.xml claims about an FMU, measured on its binary."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -53,9 +53,9 @@ def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
 
 def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -> FloatArray:
     """Return unknowns at a point."""
-    fmu = instance.fmu
-    states = np.array([point[n] for n in fmu.states()])
-    others = {n: v for n, v in point.items() if n not in fmu.states() and n != "time"}
+    names = instance.fmu.state_elements
+    states = np.array([point[n] for n in names])
+    others = {n: v for n, v in point.items() if n not in names and n != "time"}
     instance.derivatives(point["time"], states, others)
     return instance.get(unknowns)
 
@@ -122,20 +122,32 @@ def directional_error(fmu: Fmu) -> float:
 
     Relative to the size of each unknown's derivative in nominal units of the knowns.
     """
-    seeds, step, worst = np.random.default_rng(2), 1e-6, 0.0
-    unknowns = _differentiated(fmu)
+    drawn, worst, unknowns = np.random.default_rng(2), 0.0, _differentiated(fmu)
     for instance, point in _at_points(fmu, 2):
-        knowns = [k for k in point if k != "time"]
-        seed = np.array([fmu.nominals[k] * seeds.uniform(-1.0, 1.0) for k in knowns])
-        ends = []
-        for way in (step, -step):
-            moved = {k: point[k] + way * d for k, d in zip(knowns, seed, strict=True)}
-            ends.append(evaluate(instance, {**point, **moved}, unknowns))
-        here = evaluate(instance, point, unknowns)
-        exact = instance.directional(unknowns, knowns, seed)
-        difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
-        worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
+        seed = {k: fmu.nominals[k] * drawn.uniform(-1.0, 1.0) for k in point if k != "time"}
+        worst = max(worst, float(np.max(difference_error(instance, point, unknowns, seed, 1e-6))))
     return worst
+
+
+def difference_error(
+    instance: Instance,
+    point: dict[str, float],
+    unknowns: list[str],
+    seed: Mapping[str, float],
+    step: float,
+) -> FloatArray:
+    """Return how far directional derivatives (n,) along a seed are from central differences.
+
+    Relative to the size of derivative and value; a difference is over `step` times the seed.
+    """
+    ends = []
+    for way in (step, -step):
+        moved = {k: point[k] + way * d for k, d in seed.items()}
+        ends.append(evaluate(instance, {**point, **moved}, unknowns))
+    here = evaluate(instance, point, unknowns)
+    exact = instance.directional(unknowns, list(seed), list(seed.values()))
+    difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
+    return np.asarray(difference / (np.abs(exact) + np.abs(here) + 1e-300))
 
 
 def _differentiated(fmu: Fmu) -> list[str]:

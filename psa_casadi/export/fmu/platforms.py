@@ -12,15 +12,7 @@ from psa_casadi.cache import cached
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
 from psa_casadi.files import temporary_folder
-from psa_casadi.simulation.compiler import (
-    INSTALL_ZIG,
-    OPTIMISE,
-    compiler_command,
-    has_zig,
-    run_compiler,
-    sources_directory,
-    zig_command,
-)
+from psa_casadi.simulation import compiler
 
 
 @dataclass(frozen=True)
@@ -107,10 +99,10 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     for name in names:
         result = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
         chosen.update({p.name: p for p in result})
-    if {*names} != {"host"} and not has_zig():
+    if {*names} != {"host"} and not compiler.has_zig():
         raise InputError(
             f"The machine's own compiler makes binaries for systems like this one alone; for"
-            f" {', '.join(chosen)} run `{INSTALL_ZIG}`, or export with --platforms host."
+            f" {', '.join(chosen)} run `{compiler.INSTALL_ZIG}`, or export with --platforms host."
         )
     return tuple(chosen.values())
 
@@ -128,20 +120,22 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
     libraries = ("-lm",) if target.suffix == ".so" else ()
     arguments = [
-        *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
+        *compiler.OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
         "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
     ]  # fmt: skip
-    if target.target is None or not has_zig():
+    if target.target is None or not compiler.has_zig():
         with temporary_folder() as work:
-            return _compiled(work, texts, [*compiler_command(), *arguments], output).read_bytes()
+            return _compiled(
+                work, texts, [*compiler.compiler_command(), *arguments], output
+            ).read_bytes()
     arguments = ["-target", target.target, *arguments]
     if target.suffix == ".dll":
-        start = (sources_directory() / "windows" / "start.c").read_text(encoding="utf-8")
+        start = (compiler.sources_directory() / "windows" / "start.c").read_text(encoding="utf-8")
         texts = {**texts, "windows_start.c": start}
         arguments += ["windows_start.c", *RUNTIME]
     content = (version("ziglang"), arguments, sorted(texts.items()))
     digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
-    command = [*zig_command(), *arguments]
+    command = [*compiler.zig_command(), *arguments]
     if target.suffix == ".dll":
         command += windows_alone()
     kept = cached(
@@ -164,7 +158,7 @@ def make_compiler_ready() -> None:
 
     It does so at its first use, in 1 to 4 s; nothing happens where it is not installed.
     """
-    if has_zig():
+    if compiler.has_zig():
         compile_library({"nothing.c": "int psa_nothing;\n"}, "nothing", host_platform())
 
 
@@ -172,5 +166,5 @@ def _compiled(work: Path, texts: Mapping[str, str], command: Sequence[str], outp
     """Run a compiler in a folder, with the sources; return the path of the file it wrote."""
     for name, text in texts.items():
         (work / name).write_text(text, encoding="utf-8", newline="\n")
-    run_compiler(command, work)
+    compiler.run_compiler(command, work)
     return work / output

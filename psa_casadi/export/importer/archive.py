@@ -123,6 +123,11 @@ class Element:
     starts: tuple[float, ...]
 
     @property
+    def start(self) -> float:
+        """The start value."""
+        return self.starts[self.place]
+
+    @property
     def real(self) -> bool:
         """Whether it is a floating point number."""
         return self.type in ("Real", "Float64", "Float32")
@@ -135,9 +140,11 @@ class Archive:
 
     `version` is 2 or 3, `description` fmpy's record of the XML. `references`, `nominals` and
     `bounds` map the names of variables to value references, nominal values, and the least and the
-    greatest value, infinite where there is no bound. `elements` are the numbers of all variables:
-    an array `A` has `A[1,1]`, `A[1,2]` and so on; `variables` are fmpy's records. `step_size` is
-    that of the default experiment [s], 1 ms if there is none.
+    greatest value, infinite where there is no bound; the last two those of elements, too.
+    `elements` are the numbers of all variables: an array `A` has `A[1,1]`, `A[1,2]` and so on;
+    `state_elements` are those of the continuous states, in the order of the state vector.
+    `variables` are fmpy's records. `step_size` is that of the default experiment [s], 1 ms if there
+    is none.
 
     Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
@@ -192,9 +199,15 @@ class Archive:
             self.bounds[v.name] = (low, math.inf if v.max is None else float(v.max))
         self.variables = {v.name: v for v in self.description.modelVariables}
         self.elements = dict(self._elements())
-        experiment = self.description.defaultExperiment
-        self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
+        for name, e in self.elements.items():
+            self.nominals[name] = self.nominals[e.variable]
+            self.bounds[name] = self.bounds[e.variable]
+        self.step_size = self.experiment("stepSize") or 1e-3
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
+        places = {name: k for k, name in enumerate(self._states)}
+        state_elements = [n for n, e in self.elements.items() if e.variable in places]
+        state_elements.sort(key=lambda n: places[self.elements[n].variable])
+        self.state_elements = state_elements
 
     def _read_flag(self) -> None:
         """Note that FMI 3.0 provides directional derivatives: fmpy reads the name of FMI 2.0."""
@@ -230,6 +243,15 @@ class Archive:
         """Return which of co-simulation (1) and model exchange (0) the description announces."""
         statement = ((1, self.description.coSimulation), (0, self.description.modelExchange))
         return tuple(kind for kind, announced in statement if announced is not None)
+
+    def experiment(self, name: str) -> float:
+        """Return a number of the default experiment by fmpy's name, 0 if there is none."""
+        return float(getattr(self.description.defaultExperiment, name, None) or 0.0)
+
+    @property
+    def internal_step(self) -> float:
+        """The fixed internal step of co-simulation [s], 0 if there is none."""
+        return float(getattr(self.description.coSimulation, "fixedInternalStepSize", None) or 0.0)
 
     @property
     def token(self) -> str:

@@ -1,7 +1,7 @@
 """An FMU with its binary loaded, and instances of it; the classes of fmpy call its functions.
 
-Here is what fmpy lacks: variables by name, errors that hold what the FMU said, statuses as numbers,
-and many instances of a library that is loaded once.
+Here is what fmpy lacks: variables by name, errors with the FMU's messages, statuses as numbers, and
+many instances of a library that is loaded once.
 """
 
 import ctypes
@@ -11,7 +11,7 @@ from copy import copy
 from ctypes import c_double, c_uint
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import fmpy
 import numpy as np
@@ -24,7 +24,7 @@ from psa_casadi.units import FloatArray
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 #: As often an FMU may ask for another update of its discrete states.
 _UPDATES = 100
-#: What is told of an FMU that says nothing of a call that fails.
+#: Message of an FMU that logs nothing when a call fails.
 NO_MESSAGE = "no message"
 OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3
 
@@ -157,17 +157,16 @@ class Instance:
         self.fmi._call = self._call
         two = fmu.version == 2
         self.derivatives_function = "GetDerivatives" if two else "GetContinuousStateDerivatives"
+        logging: dict[str, Any] = {"logMessage": self._log}
         if two:
             memory = fmi2.defaultCallbacks.allocateMemory, fmi2.defaultCallbacks.freeMemory
-            callbacks = fmi2.fmi2CallbackFunctions(fmi2.fmi2CallbackLoggerTYPE(self._log), *memory)
-            options = {"callbacks": callbacks, **options}
-        else:
-            options = {"logMessage": self._log, **options}
+            logger = fmi2.fmi2CallbackLoggerTYPE(self._log)
+            logging = {"callbacks": fmi2.fmi2CallbackFunctions(logger, *memory)}
         try:
-            self.fmi.instantiate(**options)
+            self.fmi.instantiate(**{**logging, **options})
         except Exception as error:  # fmpy's only one
-            statement = self.messages or "no message"
-            raise FmuError(f"the FMU gives no instance: {statement}") from error
+            logged = self.messages or NO_MESSAGE
+            raise FmuError(f"the FMU gives no instance: {logged}") from error
 
     def _log(self, *arguments: Any) -> None:
         self.messages.append((arguments[-1] or b"").decode(errors="replace"))
@@ -177,8 +176,8 @@ class Instance:
         try:
             return type(self.fmi)._call(self.fmi, function, *arguments)
         except fmi1.FMICallException as error:
-            statement = self.messages[-1] if self.messages else NO_MESSAGE
-            text = f"{function} returned status {error.status}: {statement}"
+            logged = self.messages[-1] if self.messages else NO_MESSAGE
+            text = f"{function} returned status {error.status}: {logged}"
             raise FmuError(text, error.status) from None
 
     def __enter__(self) -> Self:
@@ -232,11 +231,11 @@ class Instance:
         return result
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Set variables; elements of arrays that are not given are set to their starts."""
-        inputs = np.array(list(values.values()), dtype=float)
+        """Set variables; elements of arrays without a value here are set to their starts."""
+        numbers = np.array(list(values.values()), dtype=float)
         for g in self.fmu.groups(tuple(values)):
             every = np.array(g.starts)
-            every[g.places] = inputs[g.rows]
+            every[g.places] = numbers[g.rows]
             real = g.type in ("Real", "Float64", "Float32")
             whole = every if real else [int(v) for v in np.rint(every)]
             getattr(self.fmi, f"set{g.type}")(g.references, whole)
@@ -245,16 +244,16 @@ class Instance:
         """Do one communication step."""
         self.fmi.doStep(point, size)
 
-    def set_rates(self, rates: Mapping[str, float], order: int = 1) -> None:
+    def set_rates(self, rates: Mapping[str, float]) -> None:
         """Set the time derivatives of inputs for the next communication step (FMI 2.0 only)."""
         names = self.references(list(rates))
-        self.fmi.setRealInputDerivatives(names, [order] * len(rates), list(rates.values()))
+        self.fmi.setRealInputDerivatives(names, [1] * len(rates), list(rates.values()))
 
-    def output_rates(self, names: Sequence[str], order: int = 1) -> FloatArray:
+    def output_rates(self, names: Sequence[str]) -> FloatArray:
         """Return the time derivatives of outputs at the end of the last communication step."""
         two = self.fmu.version == 2
         read = self.fmi.getRealOutputDerivatives if two else self.fmi.getOutputDerivatives
-        return np.array(read(self.references(names), [order] * len(names)))
+        return np.array(read(self.references(names), [1] * len(names)))
 
     def update_discrete_states(self) -> list[bool]:
         """Update in event mode; return whether to repeat, end, look at nominals, states, time.
@@ -309,22 +308,29 @@ class Instance:
         names = self.references(unknowns), self.references(knowns)
         return np.array(self.fmi.getAdjointDerivative(*names, list(seed), len(knowns)))
 
-    def save(self) -> Any:
-        """Return a snapshot of the instance's state; release it with `drop`."""
-        return self.fmi.getFMUState()
 
-    def restore(self, snapshot: Any) -> None:
-        """Set the instance to a snapshot."""
-        self.fmi.setFMUState(snapshot)
+@dataclass(frozen=True)
+class Signals:
+    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`.
 
-    def drop(self, snapshot: Any) -> None:
-        """Release a snapshot."""
-        self.fmi.freeFMUState(snapshot)
+    With `held` they keep the value of a knot up to the next one, where they jump.
+    """
 
-    def serialize(self, snapshot: Any) -> bytes:
-        """Return a snapshot as bytes."""
-        return bytes(self.fmi.serializeFMUState(snapshot))
+    names: tuple[str, ...]
+    times: FloatArray
+    values: FloatArray
+    held: bool = False
 
-    def deserialize(self, data: bytes) -> Any:
-        """Return the snapshot that bytes hold; release it with `drop`."""
-        return self.fmi.deserializeFMUState(data)
+    def at(self, times: FloatArray | float, *, before: bool = False) -> FloatArray:
+        """Return the inputs at times (n,), shape (n, nu); at a jump those after it, or `before`."""
+        wanted = np.atleast_1d(np.asarray(times, dtype=float))
+        if self.held:
+            side: Literal["left", "right"] = "left" if before else "right"
+            rows = np.searchsorted(self.times, wanted, side) - 1
+            return self.values[np.maximum(rows, 0)]
+        columns = [np.interp(wanted, self.times, column) for column in self.values.T]
+        return np.array(columns).reshape(len(self.names), len(wanted)).T
+
+    def on(self, times: FloatArray) -> "Signals":
+        """Return the signals sampled at times: what an importer that samples them passes on."""
+        return Signals(self.names, times, self.at(times), self.held)

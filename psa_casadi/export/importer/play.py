@@ -22,9 +22,9 @@ from psa_casadi.export.importer.fmu import (
     Fmu,
     FmuError,
     Instance,
+    Signals,
 )
 from psa_casadi.export.importer.imported import opened
-from psa_casadi.export.importer.signals import Signals
 from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
@@ -114,13 +114,11 @@ def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
     co, gaps = fmu.description.coSimulation, np.diff(t)
     if not len(gaps):
         return t
-    statement = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    most = float(statement) if statement else math.inf
-    most = min(most, float(np.max(gaps))) / parts
-    internal, middle = getattr(co, "fixedInternalStepSize", None), float(np.median(gaps))
+    most = min(fmu.experiment("stepSize") or math.inf, float(np.max(gaps))) / parts
+    internal, middle = fmu.internal_step, float(np.median(gaps))
     even = bool(np.ptp(gaps) <= _SAME * middle)
     if internal:
-        size = float(internal) * max(1, math.floor(middle / parts / float(internal) * (1 + _SAME)))
+        size = internal * max(1, math.floor(middle / parts / internal * (1 + _SAME)))
     elif co.canHandleVariableCommunicationStepSize:
         counts = np.ceil(gaps / most * (1 - _SAME)).astype(int).clip(1)
         inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(t, t[1:], counts)]  # noqa: B905
@@ -174,8 +172,8 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
         needed = bool(output.needsCompletedIntegratorStep) and not finished
         inputs = _Inputs(instance, run)
         solver = _Solver(
-            nx=sum(fmu.elements[n].variable in set(fmu.states()) for n in fmu.elements),
-            nz=fmu.indicator_count(), get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
+            nx=len(fmu.state_elements), nz=fmu.indicator_count(),
+            get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
             get_dx=fmi.getDerivatives if two else fmi.getContinuousStateDerivatives,
             get_z=fmi.getEventIndicators, get_nominals=fmi.getNominalsOfContinuousStates,
             set_time=fmi.setTime, input=inputs, startTime=t[0], maxStep=(t[-1] - t[0]) / 50.0,

@@ -51,8 +51,9 @@ _SETTLED, _MOST_PARTS = 5e-4, 32
 _PARTS: dict[str, int] = {}
 #: Runs that are kept, and how long [s] until it is looked whether the work is to end.
 _KEPT, _LOOK = 512, 0.1
-#: What a model has in the place of an FMU: outputs that are played to it, inputs that it gives.
-_PLAYED, _GIVEN = "played_", "given_"
+#: Prefixes of names in a model without its FMU: the FMU's outputs, which are played to it as
+#: inputs, and the FMU's inputs, which are its outputs.
+PLAYED, GIVEN = "played_", "given_"
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ class Played:
         items = list(model.output_names if outputs is None else outputs)
         away, names = x0 - begun(model, t, u, {}).x, inner.output_names
         states = dict(zip(model.state_names, away.tolist(), strict=True))
-        count, inputs = len(unknowns), [_GIVEN + n for n in model.input_names]
+        count, inputs = len(unknowns), [GIVEN + n for n in model.input_names]
 
         def around(y: FloatArray, texts: Sequence[str], by: Sequence[str | int]) -> Steps:
             """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
@@ -225,8 +226,8 @@ class _InnerEquations:
     outputs: tuple[str, ...]
 
     def __call__(self, s: Symbols) -> Equations:
-        expressions: dict[str, Expression] = {_GIVEN + n: getattr(s, n) for n in self.inputs}
-        table = {n: getattr(s, _PLAYED + n) for n in self.outputs}
+        expressions: dict[str, Expression] = {GIVEN + n: getattr(s, n) for n in self.inputs}
+        table = {n: getattr(s, PLAYED + n) for n in self.outputs}
         return Equations(out={**table, **expressions})
 
 
@@ -252,8 +253,8 @@ def _inner(component: Component) -> Component:
     plain = replace(
         opened.component if opened else component,
         equations=_InnerEquations(tuple(i.name for i in inputs), tuple(o.name for o in outputs)),
-        inputs=(*inputs, *(Input(_PLAYED + o.name, o.unit, o.description) for o in outputs)),
-        outputs=(*outputs, *(Output(_GIVEN + i.name, i.unit, i.description) for i in inputs)),
+        inputs=(*inputs, *(Input(PLAYED + o.name, o.unit, o.description) for o in outputs)),
+        outputs=(*outputs, *(Output(GIVEN + i.name, i.unit, i.description) for i in inputs)),
         foreign=None,
         played=None,
     )
@@ -267,12 +268,12 @@ def _loops(structure: Structure) -> bool:
     reach = closure(dependence(structure.xdot, structure.x))
     played = ca.vertcat(
         ca.SX(0, 1),
-        *(structure.symbols[i.name] for i in structure.inputs if i.name.startswith(_PLAYED)),
+        *(structure.symbols[i.name] for i in structure.inputs if i.name.startswith(PLAYED)),
     )
     hit = [k for k, rate in enumerate(ca.vertsplit(structure.xdot)) if ca.depends_on(rate, played)]
     behind = [k for k in range(structure.x.numel()) if any(k == j or reach[k, j] for j in hit)]
     reached = ca.vertcat(played, structure.x[behind])
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
     return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
 
 
@@ -280,7 +281,7 @@ def _loops(structure: Structure) -> bool:
 @in_turn
 def _filtered(structure: Structure) -> bool:
     """Whether what is given to an FMU has a memory, so that held inputs are not held there."""
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
     return bool(rows and structure.x.numel() and ca.depends_on(structure.y[rows], structure.x))
 
 
