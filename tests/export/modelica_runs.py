@@ -13,7 +13,7 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.units import FloatArray
 
 _SAMPLES = 200
-#: The connectors and parts of Modelica's library that the wired example names, in our own words.
+#: The connectors and parts of Modelica's library that the wired example names, as stubs.
 STUB = Path(__file__).with_name("modelica_stub.mo").read_text("utf-8")
 
 

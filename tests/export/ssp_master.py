@@ -1,6 +1,6 @@
 """A master of SSP archives: all FMUs of a system stepped side by side (Jacobi's scheme).
 
-fmpy's own passes values on after a step only, and reads no parameter sets. Here, at every
+fmpy's passes values on after a step only, and reads no parameter sets. Here, at every
 communication point, the parts exchange their outputs in the order in which outputs depend on
 inputs, so that all values belong to that point. Over the step that follows each part sees its
 inputs held (an error of first order in the step) or, with `rates`, as straight lines whose slopes
@@ -122,7 +122,7 @@ def couple(
 ) -> FloatArray:
     """Simulate a system over communication points `times` (n,); return its outputs (n, ny).
 
-    `inputs` are the system's; those not given keep their start values. Parameters are those of
+    `inputs` are the system's; the others keep their start values. Parameters are those of
     the archive's parameter sets, but for `values` by "part.parameter". `tolerance` is the relative
     tolerance inside each part.
 

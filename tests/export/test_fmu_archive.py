@@ -1,6 +1,6 @@
 """What is inside an FMU: sources that compile alone, binaries that load, terminals, icons, pages.
 
-And what the check says of FMUs that another version of CasADi made.
+And the check of FMUs that another version of CasADi made.
 """
 
 import html
@@ -108,7 +108,7 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     }
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.version", lambda _: "99")
     result.add(compile_library(texts, "psa", linux))
-    item = replace(linux, target=None)  # a machine's own compiler may change without a new name
+    item = replace(linux, target=None)  # a machine's compiler may change without a new name
     result |= {compile_library(texts, "psa", item) for _ in range(2)}
     assert len(result) == len(calls) == 7
 
@@ -167,7 +167,7 @@ def test_an_export_of_another_casadi_is_reproducible(older: Path) -> None:
     assert f"CasADi {NOW}" in row.remark
 
 
-#: What is changed in it, and what the row says then.
+#: What is changed in it, and the remark of the row then.
 CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "equation": ("sources/model.c", lambda t: t.replace(b"b0", b"c0", 1), "the token is"),
     "version": ("sources/model.c", lambda t: t.replace(b"3.7.9", NOW.encode()), "model.c differs"),
@@ -378,7 +378,7 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
     assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
 
 
-SAID = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+STATED = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
 LICENSE = (Path(__file__).parents[2] / "LICENSE").read_text(encoding="utf-8")
 
 
@@ -405,7 +405,14 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
     plain, path = tmp_path / "model.json", tmp_path / "m.fmu"
     model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
     save_model(model, plain)
-    options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
+    options = [
+        "--author",
+        STATED.author,
+        "--copyright",
+        STATED.copyright,
+        "--license",
+        STATED.license,
+    ]
     command = ("export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path)
     done(*command, *options)
     with zipfile.ZipFile(path) as archive:
@@ -413,7 +420,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
         terms, page = (archive.read(f"documentation/{n}").decode()
                        for n in ("licenses/license.txt", "index.html"))  # fmt: skip
     assert_valid(xml, "schema", f"fmi{fmi}", f"fmi{fmi}ModelDescription.xsd")
-    stated = replace(SAID, version="0.9").stated
+    stated = replace(STATED, version="0.9").stated
     assert {n: ET.fromstring(xml).attrib[n] for n in stated} == stated
     assert all(f"{name}: {text}" in terms for name, text in stated.items())
     assert "(c) 2026 A. Author &amp; sons" in page

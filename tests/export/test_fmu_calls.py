@@ -1,4 +1,4 @@
-"""What an FMU says and does where calls fail, look wrong, or are sent with ill will.
+"""Messages and behaviour of an FMU where calls fail, look wrong, or are sent with ill will.
 
 Refused in words, never a crash or a hang; and what FMI 3.0 has beyond FMI 2.0: event mode,
 intermediate updates, early return.
@@ -144,16 +144,16 @@ def slave() -> Iterator[Instance3]:
 
 @pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
 @pytest.mark.parametrize(
-    ("changed", "value", "said"),
+    ("changed", "value", "match"),
     [("guid", "{0}", "token"), ("instanceName", "", "name is missing")],
 )
 def test_wrong_token_and_missing_name_give_no_instance(
-    interface: int, changed: str, value: str, said: str, monkeypatch: pytest.MonkeyPatch
+    interface: int, changed: str, value: str, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for fmi in (2, 3):
         with Fmu(exported(STACK, fmi)) as fmu:
             monkeypatch.setattr(fmu.loaded(interface), changed, value)
-            with pytest.raises(FmuError, match=said):
+            with pytest.raises(FmuError, match=match):
                 fmu.open(interface)
 
 
@@ -330,7 +330,7 @@ def _play(slave: Instance3, first: int, last: int) -> bytes:
 
 
 def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Instance3) -> None:
-    """Two instances at different addresses write the same bytes; time stands where it should."""
+    """Two instances at different addresses write the same bytes; time is at its place."""
     _play(slave, 0, 7)
     data = slave.serialized()
     with Instance3(slave.fmu) as other:
@@ -393,7 +393,7 @@ def _saved(instance: Instance, moved: str) -> bytes:
 
 
 def _use(instance: Instance, moved: str) -> str:
-    """Set, step, differentiate and read an instance; return what it says if it refuses."""
+    """Set, step, differentiate and read an instance; return its message if it refuses."""
     state = instance.fmu.states()[0]
     try:
         now = float(instance.get(["time"])[0])
@@ -449,7 +449,7 @@ def test_a_forged_parameter_is_named(either: Instance) -> None:
 
 
 def test_a_snapshot_that_frees_itself(either: Instance) -> None:
-    """Some importers pass the snapshot where its address is asked for; reference FMUs bear it."""
+    """Some importers pass the snapshot in the place of its address; reference FMUs bear it."""
     snapshot = either.fmi.getFMUState()
     word = "FMUstate" if either.fmu.version == 2 else "FMUState"
     assert (

@@ -1,6 +1,6 @@
 """Directional and adjoint derivatives, at a point and through a co-simulation step.
 
-CasADi's own importer must see the right Jacobians, also those by parameters. It takes the sparsity
+CasADi's importer must see the right Jacobians, also those by parameters. It takes the sparsity
 from the dependencies in modelDescription.xml, and is silently wrong where one is missing.
 """
 
@@ -84,11 +84,11 @@ def _jacobian(
     return np.array([instance.directional(unknowns, knowns, list(c)) for c in columns]).T
 
 
-def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
+def _worst(result: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
     """Return the largest difference, each row relative to its largest effect."""
     effects = np.abs(truth * scales)
     rows = np.maximum(effects.max(axis=1), 1e-300)
-    return float((np.abs((found - truth) * scales) / rows[:, None]).max())
+    return float((np.abs((result - truth) * scales) / rows[:, None]).max())
 
 
 def test_what_cannot_be_differentiated_is_refused() -> None:

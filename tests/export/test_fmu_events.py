@@ -222,7 +222,7 @@ def _signal(t: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def truth() -> dict[float, float]:
-    """Displacement at the ends of all steps that are tried, by a computation of its own."""
+    """Displacement at the ends of all steps that are tried, by an independent computation."""
     times = np.linspace(0.0, END, 2 * 3200 + 1)
     exact = reference.simulate(
         model_named(STACK).values, lambda t: float(_signal(np.array(t))), times
@@ -308,7 +308,7 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
 
 
 def test_a_jump_in_event_mode_starts_a_new_line() -> None:
-    """FMI 3.0: the step after event mode is held, whatever was given before."""
+    """FMI 3.0: the step after event mode is held, whatever was set before."""
     with Fmu(exported(STACK, 3)) as fmu:
         ends = []
         for line in (0.0, 1.0):

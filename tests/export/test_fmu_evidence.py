@@ -1,6 +1,6 @@
 """The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
 
-What an FMU says outside of what the records behind its model have shown, and `psa check
+The output of an FMU outside of the range of its model's records, and `psa check
 --evidence`, which plays run and records again.
 """
 
@@ -143,7 +143,7 @@ _SAID = "From here on the results are extrapolated."
 def messages(
     fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
 ) -> tuple[list[str], np.ndarray]:
-    """Return what an FMU says of a triangle, and the output, in co-simulation."""
+    """Return a triangle and the output of an FMU on it, in co-simulation."""
     times = start + np.linspace(0.0, duration, steps + 1)
     volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
     inputs = Signals(("voltage",), times, volts[:, None])
@@ -186,8 +186,8 @@ def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
 
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
-    observed = replace(stated().seen, temperature=Interval(290.0, 300.0))
-    output = replace(stated(), seen=observed)
+    ranges = replace(stated().seen, temperature=Interval(290.0, 300.0))
+    output = replace(stated(), seen=ranges)
     assert "seen_temperature_low" not in with_validity(replace(model, evidence=output)).values
     warm = replace(model.with_effect(psa.EFFECTS["temperature"]), evidence=output)
     watched = with_validity(warm)
@@ -307,6 +307,6 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
 
 @pytest.mark.slow
 def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
-    """Where none is asked for, it passes: tests/export/test_fmu.py."""
+    """Without `evidence` it passes: tests/export/test_fmu.py."""
     report = psa.check_fmu(exported("P-885.51"), evidence=True)
     assert [r.name for r in report.failures] == ["evidence"]

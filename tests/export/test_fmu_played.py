@@ -51,9 +51,9 @@ def _own() -> psa.Model:
     )  # fmt: skip
 
 
-def _record(area: float, outlet: float, shown: FloatArray | None = None) -> dict[str, FloatArray]:
+def _record(area: float, outlet: float, y: FloatArray | None = None) -> dict[str, FloatArray]:
     """Return what is measured of a tank; nothing of its equations is the FMU's."""
-    y = level(area, outlet) if shown is None else shown
+    y = level(area, outlet) if y is None else y
     noise = 1e-3 * np.random.default_rng(5).standard_normal(len(TIMES))
     return {"time": TIMES, "inflow": INFLOW, "level": y + noise}
 
@@ -162,7 +162,7 @@ def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> Non
     k_ = psa.Parameter("k", 1.0, "1/s", (0.1, 9.0), "rate")
     model = psa.ode_model(ode, name="switched", parameters=[k_], outputs=["y"])
     path = psa.export_fmu(model, tmp_path / "switched.fmu", fmi=3)
-    # a step of co-simulation has one value of the input, and so begins or ends at the event
+    # a step of co-simulation has one value of the input, and so starts or ends at the event
     ways: list[tuple[FmuInterface, float]] = [("model exchange", 1e-4), ("co-simulation", 0.02)]
     for interface, most in ways:
         there = psa.fmu_model(path, free=["k"], interface=interface)

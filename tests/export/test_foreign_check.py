@@ -1,4 +1,4 @@
-"""`psa check` of FMUs of other tools: each fault of a small one is found, and nothing else."""
+"""`psa check` of FMUs of other tools: each fault of a small one fails its row alone."""
 
 import json
 import tempfile
@@ -20,7 +20,7 @@ from tests.tiers import slow_but
 
 _SOURCES = Path(__file__).with_name("faulty")
 _FOLDER = tempfile.TemporaryDirectory()
-#: The row that finds each fault, and what it says.
+#: The row that each fault fails, and its remark.
 FAULTS = {
     1: ("start values", "'k' starts at 2.5, its description says 2"),
     2: ("values are taken", "'k' was set to 2.02 and is 2"),
@@ -73,7 +73,7 @@ def test_each_fault_is_found_by_its_row(number: int) -> None:
     rows = {r.name: r for r in psa.check_fmu(faulty(number)).failures}
     name, statement = FAULTS[number]
     assert statement in rows[name].remark
-    if number != 11:  # without an instance nothing else can be seen
+    if number != 11:  # without an instance no other row can pass
         assert set(rows) <= {name} | _ALSO.get(number, set())
 
 

@@ -155,7 +155,7 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
         model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
     ).displacement[2400:]
     memory = psa.memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
-    # the record begins in motion: the fast states start there, as `start_state` has it
+    # the record starts in motion: the fast states start there, as `start_state` has it
     result = psa.simulate(model, t, voltage, memory=memory).displacement
     assert np.abs(result - whole)[50:].max() < 1e-4 * np.ptp(whole)
 
@@ -190,15 +190,15 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("turns", "options", "said"),
+    ("turns", "options", "match"),
     [
         ([np.nan], {}, "not finite"),
         ([10.0], {"sweep": 0.0}, "above 0"),
         ([10.0], {"rest": -1.0}, "0 or more"),
     ],
 )
-def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
-    with pytest.raises(psa.InputError, match=said):
+def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], match: str) -> None:
+    with pytest.raises(psa.InputError, match=match):
         psa.memory_after(STACK, turns, at=5.0, **options)
 
 
@@ -233,7 +233,7 @@ def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str
 def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
     folder: Path,
 ) -> None:
-    """Also where the start is in the model file; without it the two differ, and it is said."""
+    """Also where the start is in the model file; without it the two differ, with a message."""
     inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
     with Fmu(folder / "m.fmu") as fmu:
         truth = co_simulate(fmu, TIME, inputs, ["displacement"], tolerance=1e-9)[:, 0]
@@ -308,7 +308,7 @@ def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
     return float(np.max(np.abs(instance.get(list(expected)) - list(expected.values())) / size))
 
 
-def begun(fmu: Fmu, voltage: float) -> Instance:
+def started_at(fmu: Fmu, voltage: float) -> Instance:
     """Return an instance in initialization mode with this `start_voltage`."""
     instance = fmu.open(MODEL_EXCHANGE)
     if fmu.version == 2:
@@ -323,17 +323,17 @@ def begun(fmu: Fmu, voltage: float) -> Instance:
 @BOTH
 @pytest.mark.parametrize("voltage", [60.0, 0.0])
 def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage: float) -> None:
-    """Until the initialization ends, as the description says that outputs depend on it."""
+    """Until the initialization ends, as outputs depend on it in the description."""
     with Fmu(exported(NAME, fmi)) as fmu:
         entries = {e.variable.name: e for e in fmu.description.initialUnknowns}
         names = [n for n, e in entries.items() if START_VOLTAGE in [d.name for d in e.dependencies]]
         assert {"displacement", "der(u)"} <= set(names)
         ends = []
         for side in (0.05, -0.05):
-            with begun(fmu, voltage + side) as instance:
+            with started_at(fmu, voltage + side) as instance:
                 ends.append(instance.get(names))
         change = (ends[0] - ends[1]) / 0.1
-        with begun(fmu, voltage) as instance:
+        with started_at(fmu, voltage) as instance:
             values = instance.directional(names, [START_VOLTAGE], [1.0])
             moved = np.array([n in ("charge", "displacement", "blocked_force") for n in names])
             assert np.allclose(values[moved], change[moved], rtol=1e-4, atol=0.0)
@@ -394,7 +394,7 @@ def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> 
 
 
 def test_the_exported_start_is_that_of_the_exported_value() -> None:
-    """With its history, to the last bit; another value begins without that history."""
+    """With its history, to the last bit; another value starts without that history."""
     held = psa.settled_at(model_named(NAME), 60.0, [120.0, 0.0]).plant()
     starts = {q.name: q.start for q in held.structure.states} | {"voltage": 60.0}
     with temporary_folder() as folder:

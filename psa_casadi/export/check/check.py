@@ -38,13 +38,13 @@ from psa_casadi.strict_json import read_json
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
-#: What a whole check, and the foreign code in it, may take unless told otherwise [s], [bytes].
+#: Default limits of a whole check [s], and of the foreign code in it [bytes].
 TIMEOUT, MEMORY = 600.0, 4 << 30
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All checks of one FMU; `compared` says whether there was a model to compare with.
+    """All checks of one FMU; `compared` is true if there was a model to compare with.
 
     `left_out` names the checks that this kind of FMU has nothing for, or that need lief where that
     is not installed. A `foreign` FMU was checked by the standard alone.
@@ -82,15 +82,15 @@ def check_fmu(
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
     It is compared with `model`, else with the model it carries (resources/model.json), else with
-    none. `effects` are own ones that the model inside may have. Sensor and environment of the model
-    are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
-    the others still run, except those that need an instance if there is none.
+    none. `effects` are the user's effects that the model inside may have. Sensor and environment of
+    the model are left out if the FMU leaves them out. A check that breaks down is a row that did
+    not pass; the others still run, except those that need an instance if there is none.
 
     With `evidence` the run of the model's evidence is played again, and so are those of `records`
     that stand behind it: is the error what the model states?
 
-    This runs the code of the FMU, in a process of its own: `timeout` [s] is what all checks
-    together may take, `memory` [bytes] what the code may take beside Python's own, on Linux.
+    This runs the code of the FMU, in a separate process: `timeout` [s] is what all checks
+    together may take, `memory` [bytes] what the code may take in addition to Python, on Linux.
     However it ends, its rows are kept, and the check that ran did not pass. It is no sandbox: files
     and network are open to the code. An archive that would leave its folder, has links, is damaged
     or a bomb is not unpacked, and nothing of it runs.
@@ -98,15 +98,15 @@ def check_fmu(
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
     Without lief (`pip install lief`) the binaries are not inspected.
 
-    A `foreign` one, by default every one that another tool made and for which no model is given, is
+    A `foreign` one, by default every one of another tool without a `model`, is
     checked by the standard alone: a row fails where a clause is violated, and notes what else a
     buyer should know. See docs/fmu.md.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
 
-    Raises InputError if the file is no FMU, if evidence is asked of one with a fixed step, or if
-    `portable` is asked without lief.
+    Raises InputError if the file is no FMU, for `evidence` of one with a fixed step, and for
+    `portable` without lief.
     """
     path = Path(path)
     if portable and not binaries.has_lief():

@@ -34,7 +34,7 @@ _DIFFERENCE, _SLOPE = 1e-5, 1e-3
 #: Two runs that differ by this share are not the same, but for rounding; so are two values of
 #: single precision.
 _ROUNDING, _SINGLE = 1e-9, 1e-6
-#: Inputs of a run, by step, as shares of their nominal values beside their starts.
+#: Inputs of a run, by step, as shares of their nominal values from their starts.
 _SHARES = (0.0, 0.1, 0.1, -0.1, 0.05)
 #: Interfaces by the words of rows.
 _WORDS = {CO_SIMULATION: "co-simulation", MODEL_EXCHANGE: "model exchange"}
@@ -119,7 +119,7 @@ def _row(fmu: Fmu, name: str, look: _Look) -> CheckRow:
 
 
 def _step(fmu: Fmu) -> float:
-    """Return a step that the FMU takes: of its default experiment, a multiple of its own."""
+    """Return a step that the FMU takes: its default one, as a multiple of its internal one."""
     internal = fmu.internal_step
     span = fmu.experiment("stopTime") - fmu.experiment("startTime")
     size = fmu.experiment("stepSize") or span / 100 or 0.01
@@ -437,7 +437,7 @@ def _at_events(fmu: Fmu, finding: _Finding) -> None:
 
 
 def _step_sizes(fmu: Fmu, finding: _Finding) -> None:
-    """Steps of any size are taken where the FMU says so; a note states what smaller ones change."""
+    """Steps of any size are taken if the FMU announces it; a note has the effect of the size."""
     if CO_SIMULATION not in fmu.interfaces():
         finding.notes.append("it has no co-simulation")
         return
@@ -487,7 +487,7 @@ def _speed(fmu: Fmu, finding: _Finding) -> None:
                     instance.step(count * size, size)
                 else:
                     _run(instance)
-            except FmuError:  # it may end a run of its own accord
+            except FmuError:  # it may end a run by itself
                 break
             count += 1
         each = (time.perf_counter() - begin) / max(1, count)

@@ -28,7 +28,7 @@ RUN_LIMITS = {2: 1e-5, 3: 5e-4}
 #: How far a repeated error may be off, as a share of what is stated.
 ERROR_LIMIT = 0.02
 _TOLERANCE = 1e-9
-#: What a held input may move in a step, over its range, in at most so many steps between samples.
+#: What a held input may move in a step, over its range; the most steps between two samples.
 _STEP, _MOST_STEPS = 1e-3, 1000
 
 
@@ -109,8 +109,8 @@ class Task:
     """What is to be checked: an FMU by its path (for messages) and its unpacked folder.
 
     `truth` is what to compare with, `playbacks` are runs to repeat. All checks may take `timeout`
-    [s], the foreign code `memory` [bytes] beside Python's own; that is limited on Linux only.
-    `key` marks what its process tells. A `foreign` FMU is checked by the standard alone.
+    [s], the foreign code `memory` [bytes] in addition to Python; that is limited on Linux only.
+    `key` marks the lines of its process. A `foreign` FMU is checked by the standard alone.
     """
 
     path: Path

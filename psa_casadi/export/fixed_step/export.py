@@ -86,7 +86,7 @@ def played_inputs(model: Model, shape: FloatArray) -> FloatArray:
     return u
 
 
-def shown_output(model: Model) -> str:
+def main_output(model: Model) -> str:
     """Return the name of the output that is compared: the displacement, or the first one."""
     return output_of(model) or model.output_names[0]
 
@@ -148,7 +148,7 @@ def reach(plan: CodePlan, texts: dict[str, str], allowed: float) -> float:
 def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
     """Return the largest error over the range of the output on inputs (n, nu)."""
     model = plan.model
-    output = model.output_names.index(shown_output(model))
+    output = model.output_names.index(main_output(model))
     x0 = np.array([q.start for q in model.structure.states])
     times = plan.step * np.arange(len(u), dtype=np.float64)
     hold = "zero" if plan.held else "linear"
@@ -160,14 +160,14 @@ def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
     return worst if np.isfinite(worst) else float("inf")
 
 
-#: Substeps that are tried where none are asked for, and the error that is good enough.
+#: Substeps that are tried by default, and the error that is good enough.
 SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3
 #: Error beyond which a step is of no use.
 USELESS = 0.1
 #: Two times that differ by less than this share are one.
 _SAME = 1e-9
 _HELD = {"linear": False, "zero": True}
-#: Plans a model's step, or says why it has none.
+#: Returns the plan of a model's step with its source, or why it has none.
 Attempt = Callable[[Model], tuple[code.CodePlan, str] | str]
 
 
@@ -229,7 +229,7 @@ def fixed_step(
         if not model.structure.states:
             cure = f"{precision} precision is too coarse for this model: take double"
         raise InputError(
-            f"With a step of {step:g} s in {plan.substeps} substeps the {shown_output(model)} errs"
+            f"With a step of {step:g} s in {plan.substeps} substeps the {main_output(model)} errs"
             f" by {100 * worst.error:.3g} % of its range on {worst.voltage}; {cure}."
         )
     # the voltage is limited to where the step is as good as on the reference ones
@@ -239,7 +239,7 @@ def fixed_step(
 
 
 def header_code(plan: code.CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
-    """Return the header; its comment tells the `errors` that were measured."""
+    """Return the header; its comment states the `errors` that were measured."""
     model = plan.model
     return filled(
         "fixed_step.h",
@@ -249,7 +249,7 @@ def header_code(plan: code.CodePlan, errors: tuple[VoltageError, ...] = ()) -> s
         errors=errors,
         steps=STEPS,
         voltages=VOLTAGES,
-        shown=shown_output(model) if errors else "",
+        output=main_output(model) if errors else "",
         limit_words=code.limit_words(plan.limit),
         licence="\n".join(code_license().splitlines()),
         tool=generation_tool(),

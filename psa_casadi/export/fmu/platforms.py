@@ -12,7 +12,15 @@ from psa_casadi.cache import cached
 from psa_casadi.errors import InputError
 from psa_casadi.export.fmu.sources import compiled_files
 from psa_casadi.files import temporary_folder
-from psa_casadi.simulation import compiler
+from psa_casadi.simulation.compiler import (
+    INSTALL_ZIG,
+    OPTIMISE,
+    compiler_command,
+    has_zig,
+    run_compiler,
+    sources_directory,
+    zig_command,
+)
 
 
 @dataclass(frozen=True)
@@ -21,12 +29,12 @@ class Platform:
 
     `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2, which has names
     for x86 alone and takes the tuples of FMI 3 for the others (FMI 2.0.4, section 2.3).
-    Old systems are asked for, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
+    The targets are old systems, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
     Linux, 2.27 on RISC-V, the first one there, and macOS 11 (of 2020), the first for both
     processors. 32-bit ARM is what Debian's and Ubuntu's armhf run on: ARMv7 with 16 registers for
     doubles, in which they are handed over. 32-bit x86 has SSE2, so that doubles are rounded as
     everywhere else. Windows has the universal C runtime, and a library of an FMU needs nothing
-    beside it but `fmu_src/windows/start.c`. The C library of MinGW-w64, which the compiler would
+    else but `fmu_src/windows/start.c`. The C library of MinGW-w64, which the compiler would
     make at its first use, takes it a minute for each processor.
     """
 
@@ -83,7 +91,7 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
 
     A platform that is named is one of the table, and its binary loads on old systems; "host" is
-    this machine, and its own compiler will do.
+    this machine, for which its compiler will do.
 
     Raises InputError for a name that is not known, and for platforms that are named where the
     `ziglang` compiler is not installed.
@@ -99,10 +107,10 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     for name in names:
         result = PLATFORMS.values() if name == "all" else [PLATFORMS.get(name) or host_platform()]
         chosen.update({p.name: p for p in result})
-    if {*names} != {"host"} and not compiler.has_zig():
+    if {*names} != {"host"} and not has_zig():
         raise InputError(
             f"The machine's own compiler makes binaries for systems like this one alone; for"
-            f" {', '.join(chosen)} run `{compiler.INSTALL_ZIG}`, or export with --platforms host."
+            f" {', '.join(chosen)} run `{INSTALL_ZIG}`, or export with --platforms host."
         )
     return tuple(chosen.values())
 
@@ -111,8 +119,8 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     """Compile sources to a shared library that exports only FMI functions; return its bytes.
 
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
-    version, so that the same model is compiled once. Without it, this machine's binary is made by
-    its own compiler, which may change unseen, and for its own C library.
+    version, so that the same model is compiled once. Without it, this machine's compiler makes
+    its binary, for its C library; that compiler may change without notice.
 
     Raises MachineError with the compiler's messages if it fails.
     """
@@ -120,22 +128,20 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     own_name = ("-Wl,-install_name,@rpath/" + output,) if target.suffix == ".dylib" else ()
     libraries = ("-lm",) if target.suffix == ".so" else ()
     arguments = [
-        *compiler.OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
+        *OPTIMISE, *target.flags, *own_name, "-g0", "-fvisibility=hidden",
         "-shared", "-I.", *compiled_files(dict(texts)), *libraries, "-o", output,
     ]  # fmt: skip
-    if target.target is None or not compiler.has_zig():
+    if target.target is None or not has_zig():
         with temporary_folder() as work:
-            return _compiled(
-                work, texts, [*compiler.compiler_command(), *arguments], output
-            ).read_bytes()
+            return _compiled(work, texts, [*compiler_command(), *arguments], output).read_bytes()
     arguments = ["-target", target.target, *arguments]
     if target.suffix == ".dll":
-        start = (compiler.sources_directory() / "windows" / "start.c").read_text(encoding="utf-8")
+        start = (sources_directory() / "windows" / "start.c").read_text(encoding="utf-8")
         texts = {**texts, "windows_start.c": start}
         arguments += ["windows_start.c", *RUNTIME]
     content = (version("ziglang"), arguments, sorted(texts.items()))
     digest = hashlib.sha256(repr(content).encode("utf-8")).hexdigest()[:32]
-    command = [*compiler.zig_command(), *arguments]
+    command = [*zig_command(), *arguments]
     if target.suffix == ".dll":
         command += windows_alone()
     kept = cached(
@@ -154,11 +160,11 @@ def windows_alone() -> list[str]:
 
 
 def make_compiler_ready() -> None:
-    """Let the `ziglang` compiler make its own parts for this machine's platform.
+    """Let the `ziglang` compiler make its libraries for this machine's platform.
 
     It does so at its first use, in 1 to 4 s; nothing happens where it is not installed.
     """
-    if compiler.has_zig():
+    if has_zig():
         compile_library({"nothing.c": "int psa_nothing;\n"}, "nothing", host_platform())
 
 
@@ -166,5 +172,5 @@ def _compiled(work: Path, texts: Mapping[str, str], command: Sequence[str], outp
     """Run a compiler in a folder, with the sources; return the path of the file it wrote."""
     for name, text in texts.items():
         (work / name).write_text(text, encoding="utf-8", newline="\n")
-    compiler.run_compiler(command, work)
+    run_compiler(command, work)
     return work / output

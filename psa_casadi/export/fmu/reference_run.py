@@ -1,13 +1,13 @@
 """A run inside the FMU to try an importer on: inputs, parameters and the outputs to expect.
 
-The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike. On this run
-is measured how short a communication step must be where an importer holds the inputs over it. A
+The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives. On this run is
+measured how short a communication step must be where an importer holds the inputs over it. A
 held signal is late by half a step h on average: an output that moves at the rate dy/dt errs by
 h/2 |dy/dt|. So the step for an error of a share e of the range R follows from the signal alone,
 
     h = 2 e R / max |dy/dt|,  for a sine of frequency f over the whole range  h = 2 e / (pi f),
 
-as long as h is short against what the model adds of its own: lags, resonances, the slope of a loop.
+as long as h is short against the dynamics of the model: lags, resonances, the slope of a loop.
 
 Sources: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of the
 Modelica Association; Astrom and Wittenmark 1997, Computer-Controlled Systems (a hold delays by half
@@ -51,7 +51,7 @@ def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, by
     """Return the files of the reference run by their place in the archive.
 
     The manifest lists the files `more` too, which it does not make. Raises SimulationError if the
-    model cannot be simulated with its own values.
+    model cannot be simulated with its values.
     """
     times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])

@@ -130,7 +130,7 @@ class Fmu(Archive):
 class _Group:
     """Numbers that one call gets or sets: those of variables of a type.
 
-    They are the `rows` among the names that were asked for, and the `places` among the values of
+    They are the `rows` among the wanted names, and the `places` among the values of
     the call; `starts` are all of these.
     """
 

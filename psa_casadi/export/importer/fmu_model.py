@@ -131,7 +131,7 @@ def _has_exact_start(fmu: Fmu, name: str) -> bool:
 def _has_equations(fmu: Fmu) -> bool:
     """Whether an FMU is an ordinary differential equation x' = f(t, x, u, p), but for its times.
 
-    By model exchange of its own binary, in several instances, without event indicators, real
+    By model exchange of its binary, in several instances, without event indicators, real
     numbers in and one at least out.
     """
     exchange = fmu.description.modelExchange
@@ -149,7 +149,7 @@ def _has_equations(fmu: Fmu) -> bool:
 def _free(
     fmu: Fmu, free: Free | None, numbers: Iterable[str], problems: Problems
 ) -> dict[str, tuple[float, float] | Parameter]:
-    """Return the parameters to identify with their bounds: those given, else the FMU's."""
+    """Return the parameters to identify with their bounds: those of `free`, else the FMU's."""
     reals = {n for n in numbers if fmu.elements[n].real}
     bounded = {n for n in reals if math.isfinite(math.hypot(*fmu.bounds[n]))}
     if free is None:
@@ -252,16 +252,16 @@ def fmu_model(
     derivatives where it has them, else central differences; those by p are central differences of
     instances initialised with other values. The states start where the FMU starts.
 
-    Any other one is run as a whole, in processes of its own: by model exchange with its events
+    Any other one is run as a whole, in separate processes: by model exchange with its events
     (fmpy's CVode), or by co-simulation where it has no other interface. Its inputs and outputs are
     the ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It
-    begins in its start values at the beginning of each record. Between communication points an
+    starts from its start values at the beginning of each record. Between communication points an
     input is a straight line where the FMU takes input derivatives, else its mean over the step;
     these are the samples, or as many parts of them as it takes until twice as many change no output
     by more than 0.05 % of its standard deviation. Numbers of every type are inputs and outputs,
     elements of arrays too.
 
-    `free` says which parameters are identified: {name: (low, high)}, {name: Parameter}, or names
+    `free` are the parameters that are identified: {name: (low, high)}, {name: Parameter}, or names
     whose least and greatest values the FMU declares; by default all parameters that have both. Of
     one run as a whole, start values of its variables can be named, too. A range of a decade or more
     above 0 is searched on a logarithmic scale. `values` are numbers of parameters in the place of
@@ -335,14 +335,14 @@ def _composed(
 
 
 class _TimeEventError(Exception):
-    """An FMU has events at times, which is seen when it is initialised only."""
+    """An FMU has events at times, which only its initialisation shows."""
 
 
 def _of_equations(
     fmu: Fmu, file: Path, digest: str, free: Free | None, values: Mapping[str, float],
     name: str | None,
 ) -> Model:  # fmt: skip
-    """Return the model of an FMU whose equations are asked for."""
+    """Return the model of an FMU whose equations are evaluated."""
     read = read_variables(fmu, free, values)
     imported = imported_of(fmu, digest, read.selected, _sizes(read))
     declared = {n: p.value for n, p in zip(read.selected.parameters, read.parameters, strict=True)}
@@ -419,7 +419,7 @@ def load_model(
     *,
     fmu: str | os.PathLike[str] | None = None,
 ) -> Model:
-    """Read MODEL.json; `effects` are own ones of modules that it may have.
+    """Read MODEL.json; `effects` are the user's effects that it may have.
 
     Equations in the file are read as text, none of it is run. The binary of an FMU that the model
     has runs in this process: `fmu` is that FMU or the folder with it, by default the folder of

@@ -62,8 +62,8 @@ def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note,
     """Write the parameters of an FMU's model as start values, and return what is to be noted.
 
     To NAME.ssv a parameter set of SSP 1.0, in the FMU's names; to NAME.fmu the FMU with these
-    starts in its description. Its binary stays as it is: where that has starts of its own, an
-    importer must set those of the description, which the note says.
+    starts in its description. Its binary stays as it is: if that starts from other values, an
+    importer must set those of the description, and a note is returned.
 
     Raises InputError for a model that is of no FMU, and for another ending.
     """

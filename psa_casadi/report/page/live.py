@@ -13,7 +13,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
-from psa_casadi.export.web import begun_module
+from psa_casadi.export.web import future_module
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import record_start
@@ -153,7 +153,7 @@ class LiveModel:
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Begin what makes the model of a diagnosis alive; `rows` are its series."""
-    module, beyond, share, text = begun_module(d.model), list[FloatArray](), 1.0, ""
+    module, beyond, share, text = future_module(d.model), list[FloatArray](), 1.0, ""
     if isinstance(d, StackDiagnosis):
         # the page's other errors are judged by the noise of all records together
         share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
@@ -169,7 +169,7 @@ def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveMode
     records = _fitted_records(
         identification.model, identification.fit, identification.experiments, rows
     )
-    return LiveModel(identification.model, begun_module(identification.model), records)
+    return LiveModel(identification.model, future_module(identification.model), records)
 
 
 def live_design(
@@ -189,7 +189,7 @@ def live_design(
     curve, none = Curve("model", colours.EXTENDED, displayed), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
-    return LiveModel(model, begun_module(model), [row], aim=words, design=True)
+    return LiveModel(model, future_module(model), [row], aim=words, design=True)
 
 
 def live_experiment(model: Model, record: Signals) -> LiveModel:
@@ -212,7 +212,7 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
                 hold=record.hold,
             )
         )  # fmt: skip
-    return LiveModel(model, begun_module(model), rows, aim="design", design=True)
+    return LiveModel(model, future_module(model), rows, aim="design", design=True)
 
 
 def _fitted_records(
