@@ -31,8 +31,8 @@ from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import FIXED_ENTRY
 from psa_casadi.export.fmu.sources import STRICT as AS_EXPORTED
-from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError, Signals
-from psa_casadi.export.importer.masters import co_simulate
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.simulation.compiler import (

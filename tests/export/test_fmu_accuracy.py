@@ -12,15 +12,8 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.export.check.agreement import expected_outputs
-from psa_casadi.export.importer.fmu import (
-    CO_SIMULATION,
-    ERROR,
-    MODEL_EXCHANGE,
-    Fmu,
-    FmuError,
-    Signals,
-)
-from psa_casadi.export.importer.masters import co_simulate, communicate
+from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
 from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value

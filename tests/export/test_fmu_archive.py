@@ -43,7 +43,7 @@ from psa_casadi.export.fmu.reference_run import (
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError
@@ -378,7 +378,7 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
     assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
 
 
-STATED = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+TERMS = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
 LICENSE = (Path(__file__).parents[2] / "LICENSE").read_text(encoding="utf-8")
 
 
@@ -405,14 +405,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
     plain, path = tmp_path / "model.json", tmp_path / "m.fmu"
     model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
     save_model(model, plain)
-    options = [
-        "--author",
-        STATED.author,
-        "--copyright",
-        STATED.copyright,
-        "--license",
-        STATED.license,
-    ]
+    options = ["--author", TERMS.author, "--copyright", TERMS.copyright, "--license", TERMS.license]
     command = ("export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path)
     done(*command, *options)
     with zipfile.ZipFile(path) as archive:
@@ -420,7 +413,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
         terms, page = (archive.read(f"documentation/{n}").decode()
                        for n in ("licenses/license.txt", "index.html"))  # fmt: skip
     assert_valid(xml, "schema", f"fmi{fmi}", f"fmi{fmi}ModelDescription.xsd")
-    stated = replace(STATED, version="0.9").stated
+    stated = replace(TERMS, version="0.9").stated
     assert {n: ET.fromstring(xml).attrib[n] for n in stated} == stated
     assert all(f"{name}: {text}" in terms for name, text in stated.items())
     assert "(c) 2026 A. Author &amp; sons" in page

@@ -21,9 +21,8 @@ from psa_casadi.export.importer.fmu import (
     Fmu,
     FmuError,
     Instance,
-    Signals,
 )
-from psa_casadi.export.importer.masters import co_simulate
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.units import FloatArray
 from tests.export.fmi3_instances import Instance3, loaded
 from tests.export.fmu_models import entries, exported, model_named

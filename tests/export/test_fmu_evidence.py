@@ -21,8 +21,8 @@ from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
 from psa_casadi.export.fmu.reference_run import FOLDER
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, Signals
-from psa_casadi.export.importer.masters import communicate
+from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
+from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit

@@ -17,8 +17,9 @@ from psa_casadi.children import end_children
 from psa_casadi.cli.app import app
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
-from psa_casadi.export.importer.fmu import Fmu, Signals
+from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.importer.play import Run, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes

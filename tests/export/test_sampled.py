@@ -18,9 +18,8 @@ from psa_casadi.export.importer.fmu import (
     MODEL_EXCHANGE,
     Fmu,
     FmuError,
-    Signals,
 )
-from psa_casadi.export.importer.masters import co_simulate, integrate
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run

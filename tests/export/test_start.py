@@ -16,15 +16,8 @@ from psa_casadi.export.check.structure import wrong_start
 from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import (
-    CO_SIMULATION,
-    MODEL_EXCHANGE,
-    Fmu,
-    FmuError,
-    Instance,
-    Signals,
-)
-from psa_casadi.export.importer.masters import co_simulate
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state

@@ -17,7 +17,7 @@ from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, main_output, played_inputs
 from psa_casadi.export.fmu import reference_run
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
-from psa_casadi.export.importer.fmu import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.simulate import settled_at

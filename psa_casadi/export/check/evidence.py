@@ -10,7 +10,7 @@ from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
 from psa_casadi.export.fmu import evidence as carried
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model

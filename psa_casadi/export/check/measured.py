@@ -18,8 +18,8 @@ from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, s
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Signals
-from psa_casadi.export.importer.masters import co_simulate, integrate
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.units import FloatArray
 
 #: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0

@@ -11,7 +11,7 @@ from copy import copy
 from ctypes import c_double, c_uint
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import fmpy
 import numpy as np
@@ -111,16 +111,10 @@ class Fmu(Archive):
         """Return an instance; raises FmuError if the FMU refuses, InputError as `loaded`."""
         return Instance(self, interface, **options)
 
-    def start(
-        self, interface: int, *, tolerance: float | None = None,
-        values: Mapping[str, float] | None = None, start_time: float = 0.0,
-        stop_time: float | None = None, **options: Any,
-    ) -> "Instance":  # fmt: skip
-        """Return an instance that is initialised with start values; in step or continuous mode."""
-        instance = self.open(interface, **options)
-        instance.setup(
-            tolerance=tolerance, start_time=start_time, stop_time=stop_time, values=values
-        )
+    def start(self, interface: int, **experiment: Any) -> "Instance":
+        """Return an instance that `setup` has initialised; in step or continuous mode."""
+        instance = self.open(interface)
+        instance.setup(**experiment)
         if interface == MODEL_EXCHANGE:
             instance.require("EnterContinuousTimeMode")
         return instance
@@ -155,10 +149,8 @@ class Instance:
         self.next_event_time: float | None = None
         self.fmi = copy(fmu.loaded(interface))
         self.fmi._call = self._call
-        two = fmu.version == 2
-        self.derivatives_function = "GetDerivatives" if two else "GetContinuousStateDerivatives"
         logging: dict[str, Any] = {"logMessage": self._log}
-        if two:
+        if fmu.version == 2:
             memory = fmi2.defaultCallbacks.allocateMemory, fmi2.defaultCallbacks.freeMemory
             logger = fmi2.fmi2CallbackLoggerTYPE(self._log)
             logging = {"callbacks": fmi2.fmi2CallbackFunctions(logger, *memory)}
@@ -292,7 +284,8 @@ class Instance:
         self.fmi.setTime(float(time))
         self.fmi.setContinuousStates((c_double * len(x))(*x), len(x))
         self.set(inputs)
-        return self.vector(self.derivatives_function, len(x))
+        two = self.fmu.version == 2
+        return self.vector("GetDerivatives" if two else "GetContinuousStateDerivatives", len(x))
 
     def directional(
         self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float] | FloatArray
@@ -307,30 +300,3 @@ class Instance:
         """Return the gradient with respect to knowns of a weighted sum of unknowns (FMI 3.0)."""
         names = self.references(unknowns), self.references(knowns)
         return np.array(self.fmi.getAdjointDerivative(*names, list(seed), len(knowns)))
-
-
-@dataclass(frozen=True)
-class Signals:
-    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`.
-
-    With `held` they keep the value of a knot up to the next one, where they jump.
-    """
-
-    names: tuple[str, ...]
-    times: FloatArray
-    values: FloatArray
-    held: bool = False
-
-    def at(self, times: FloatArray | float, *, before: bool = False) -> FloatArray:
-        """Return the inputs at times (n,), shape (n, nu); at a jump those after it, or `before`."""
-        wanted = np.atleast_1d(np.asarray(times, dtype=float))
-        if self.held:
-            side: Literal["left", "right"] = "left" if before else "right"
-            rows = np.searchsorted(self.times, wanted, side) - 1
-            return self.values[np.maximum(rows, 0)]
-        columns = [np.interp(wanted, self.times, column) for column in self.values.T]
-        return np.array(columns).reshape(len(self.names), len(wanted)).T
-
-    def on(self, times: FloatArray) -> "Signals":
-        """Return the signals sampled at times: what an importer that samples them passes on."""
-        return Signals(self.names, times, self.at(times), self.held)

@@ -16,15 +16,9 @@ from typing import Any
 import numpy as np
 from fmpy.sundials import CVodeSolver
 
-from psa_casadi.export.importer.fmu import (
-    CO_SIMULATION,
-    MODEL_EXCHANGE,
-    NO_MESSAGE,
-    Fmu,
-    FmuError,
-    Signals,
-)
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, NO_MESSAGE, Fmu, FmuError
 from psa_casadi.export.importer.imported import opened
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
@@ -84,8 +78,8 @@ def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     during = at[:-1] if rates and lines else middle
     table = {**run.values, **dict(zip(names, at[0].tolist(), strict=True))}
     result = np.empty((len(points), len(run.outputs)))
-    first = float(points[0])
-    with fmu.start(CO_SIMULATION, values=table, start_time=first, **options) as instance:
+    with fmu.open(CO_SIMULATION, **options) as instance:
+        instance.setup(values=table, start_time=float(points[0]))
         result[0] = instance.get(run.outputs)
         for k, (begin, end) in enumerate(pairwise(points.tolist())):
             instance.set(dict(zip(names, during[k].tolist(), strict=True)))
