@@ -132,7 +132,7 @@ def couple(
     origins = [archive.origin(name) for name in outputs]
     outer = [w for w in archive.wires if w.start.part == OUTSIDE and w.start.name in inputs.names]
     inner, columns = archive.inner_wires(), dict(zip(inputs.names, inputs.at(times).T, strict=True))
-    starts = {name: dict(item) for name, item in archive.parameters.items()}
+    starts = {name: dict(listed) for name, listed in archive.parameters.items()}
     table = {
         **(values or {}),
         **{f"{w.end.part}.{w.end.name}": columns[w.start.name][0] for w in outer},

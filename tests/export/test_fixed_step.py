@@ -105,9 +105,9 @@ def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str
         '"stack.h"',
         "<math.h>",
     ]
-    item = {"advance", "outputs", "gain", "stack_init", "stack_step"}
+    functions = {"advance", "outputs", "gain", "stack_init", "stack_step"}
     code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    assert set(re.findall(r"(\w+)\(", code)) <= item | {name + suffix for name in CALLS}
+    assert set(re.findall(r"(\w+)\(", code)) <= functions | {name + suffix for name in CALLS}
     assert not re.search(r"\b(for|while|do|if|goto|static \w+ \w+\[)\b", code)
     commands = [compiler_command(), *([zig_command()] if has_zig() else [])]
     with temporary_folder() as folder:
@@ -227,8 +227,8 @@ def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
     true = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
     within = play(result, jumps)
-    displayed = true[1:, model.output_names.index(OUTPUT)]
-    assert error(within, displayed) <= max(GOOD, result.worst.error)
+    truth = true[1:, model.output_names.index(OUTPUT)]
+    assert error(within, truth) <= max(GOOD, result.worst.error)
     for beyond in (1.001, 900.0 / limit, 1e9, 1e305):
         assert np.array_equal(play(result, beyond * jumps), within)
 

@@ -55,8 +55,8 @@ def on_the_board(name: str, precision: str, folder: Path) -> tuple[FloatArray, F
     qemu = tool("qemu-system-arm")
     for file, text in fixed(name, precision).texts.items():
         (folder / file).write_text(text, encoding="utf-8")
-    inputs, displayed, size, _ = CASES[name]
-    items = [f"-DGIVEN={inputs}", f"-DSHOWN={displayed}", f"-DSIZE={size!r}f"]
+    inputs, output, size, _ = CASES[name]
+    items = [f"-DGIVEN={inputs}", f"-DSHOWN={output}", f"-DSIZE={size!r}f"]
     target = ["-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp"]
     flags = ["-std=c99", "-O2", "-fno-math-errno", "-g0"]
     places = [f"-I{HERE}", "-I.", str(HERE / "board.c"), "stack.c"]
@@ -83,12 +83,12 @@ def test_a_cortex_m4_gives_the_same_numbers_at_constant_cost(
     name: str, precision: str, tmp_path: Path
 ) -> None:
     board, instructions = on_the_board(name, precision, tmp_path)
-    inputs, displayed, size, most = CASES[name]
+    inputs, output, size, most = CASES[name]
     step = fixed(name, precision)
     model = step.plan.model
     u = played_inputs(model, np.zeros(STEPS + 1))
     u[:, model.input_names.index(inputs)] = size * moving()
-    host = Probe(step.plan, step.texts).play(u)[:, model.output_names.index(displayed)]
+    host = Probe(step.plan, step.texts).play(u)[:, model.output_names.index(output)]
     assert np.ptp(host) > 5e-6
     assert np.max(np.abs(board - host)) <= LIMITS[precision] * np.ptp(host)
     print(f"{name}, {precision}: {instructions.mean():.0f} instructions, {instructions.max():.0f}")

@@ -38,8 +38,8 @@ KINDS = "tunable tunable dependent dependent dependent"
 def _unknown(fmi: int, name: str, *knowns: str, kinds: str) -> str:
     """Return how the description lists the dependencies of an output."""
     places = " ".join(str(PLACES[n]) for n in knowns)
-    item = "index" if fmi == 2 else "valueReference"
-    return f'{item}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
+    attribute = "index" if fmi == 2 else "valueReference"
+    return f'{attribute}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
 
 
 def _dependency(
@@ -357,8 +357,8 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
     path, result = tmp_path / "b.fmu", entries(STACK, fmi)
     write_archive(path, {**result, "binaries/riscv64-linux/psa.so": result[_binary(fmi)]})
     with Archive(path) as moved:
-        (statement,) = binaries.misplaced_binaries(moved)
-    assert statement.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
+        (problem,) = binaries.misplaced_binaries(moved)
+    assert problem.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
     with Archive(exported(STACK, fmi)) as whole:
         assert not list(binaries.misplaced_binaries(whole))
 

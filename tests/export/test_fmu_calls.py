@@ -65,13 +65,11 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
             done = try_step(slave, 1e-3, 1e-3)
             assert done.status == DISCARD
             reached.value = done.time
-        statement = re.fullmatch(
-            r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1]
-        )
-        assert statement is not None
-        assert statement[2] in fmu.states()
+        match = re.fullmatch(r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1])
+        assert match is not None
+        assert match[2] in fmu.states()
         assert 1e-3 <= reached.value < 2e-3
-        assert float(statement[1]) == pytest.approx(reached.value, rel=1e-8)
+        assert float(match[1]) == pytest.approx(reached.value, rel=1e-8)
         with pytest.raises(FmuError) as refused:
             slave.step(reached.value, 1e-3)
         assert refused.value.status == ERROR
@@ -160,13 +158,13 @@ def test_wrong_token_and_missing_name_give_no_instance(
 def test_what_the_model_does_not_have_gives_no_instance() -> None:
     with pytest.raises(FmuError, match="no instance"):
         loaded(STACK).open(CO_SIMULATION, requiredIntermediateVariables=[10**6])
-    fmu, statement = loaded(STACK), list[bytes]()
+    fmu, logged = loaded(STACK), list[bytes]()
     other = FMU3ScheduledExecution(
         guid=fmu.token, modelIdentifier=fmu.identifier, unzipDirectory=str(fmu.directory)
     )
     with pytest.raises(Exception, match="Failed to instantiate"):
-        other.instantiate(logMessage=lambda *output: statement.append(output[-1]))
-    assert b"no scheduled execution" in statement[-1]
+        other.instantiate(logMessage=lambda *output: logged.append(output[-1]))
+    assert b"no scheduled execution" in logged[-1]
 
 
 def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
@@ -219,10 +217,10 @@ def test_what_the_model_does_not_have_is_refused_with_the_reason(slave: Instance
 
 
 def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instance3) -> None:
-    observed: list[tuple[Update, float]] = []
+    updates: list[tuple[Update, float]] = []
 
     def watcher(instance: Instance3, update: Update) -> None:
-        observed.append((update, float(instance.get(["displacement"])[0])))
+        updates.append((update, float(instance.get(["displacement"])[0])))
         assert instance.get(["time"])[0] == update.time
         assert np.isfinite(instance.output_rates(["displacement"])).all()
         assert instance.call("Reset") == ERROR
@@ -232,14 +230,14 @@ def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instan
         for instance in (slave, watched):
             instance.set({"voltage": 50.0})
             assert instance.try_step(0.0, 1e-3).status == OK
-        times = [u.time for u, _ in observed]
+        times = [u.time for u, _ in updates]
         assert len(times) > 5
         assert np.all(np.diff(times) > 0.0)
         assert times[-1] == pytest.approx(1e-3)
-        assert all(u.get_allowed and u.step_finished for u, _ in observed)
-        assert [u.can_return_early for u, _ in observed] == [True] * (len(observed) - 1) + [False]
-        assert [u.set_requested for u, _ in observed] == [True] * (len(observed) - 1) + [False]
-        path = [d for _, d in observed]
+        assert all(u.get_allowed and u.step_finished for u, _ in updates)
+        assert [u.can_return_early for u, _ in updates] == [True] * (len(updates) - 1) + [False]
+        assert [u.set_requested for u, _ in updates] == [True] * (len(updates) - 1) + [False]
+        path = [d for _, d in updates]
         assert 0.0 < path[0] < path[-1]
         assert slave.get(OUTPUTS).tobytes() == watched.get(OUTPUTS).tobytes()
         assert slave.serialized() == watched.serialized()
@@ -344,12 +342,11 @@ def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Insta
     foreign, damaged = "another model, version or kind of machine", "damaged"
     flips = {0: foreign, 8: foreign, 16: foreign, 40: damaged, len(data) - 1: damaged}
     broken = [
-        (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], statement)
-        for k, statement in flips.items()
+        (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], reason) for k, reason in flips.items()
     ]
-    for wrong, statement in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
+    for wrong, reason in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
         assert slave.try_restore(wrong) == ERROR
-        assert statement in slave.messages[-1]
+        assert reason in slave.messages[-1]
     with Instance3(slave.fmu, MODEL_EXCHANGE) as exchange:
         assert exchange.try_restore(data) == ERROR
         assert "other interface" in exchange.messages[-1]
@@ -412,7 +409,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     path = exported(STACK) if model == "stack" else exported("loop", 3)
     moved = "voltage" if model == "stack" else "reference"
     refused: dict[tuple[int, bytes], int] = {}
-    statement, slowest = set(), 0.0
+    refusals, slowest = set(), 0.0
     with Fmu(path) as fmu, fmu.start(CO_SIMULATION) as instance:
         data = _saved(instance, moved)
         assert _forged(data, 0, data[STAMP : STAMP + 8]) == data
@@ -426,7 +423,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
                     continue
                 instance.fmi.setFMUState(snapshot)
                 instance.fmi.freeFMUState(snapshot)
-                statement.add(_use(instance, moved))
+                refusals.add(_use(instance, moved))
                 slowest = max(slowest, time.monotonic() - begin)
         snapshot = instance.fmi.deserializeFMUState(data)
         instance.fmi.setFMUState(snapshot)
@@ -435,7 +432,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     states = range(3, 3 + len(fmu.states()))
     assert {(w, c) for w in states for c in (WORDS[0], WORDS[3])} <= set(refused)
     assert set(refused.values()) == {ERROR}
-    assert all(len(text) > 60 for text in statement - {""})
+    assert all(len(text) > 60 for text in refusals - {""})
     assert slowest < 5.0
 
 

@@ -96,7 +96,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
     with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
         instance.start()
         for kind in ("Directional", "Adjoint"):
-            for unknown, known, statement in (
+            for unknown, known, reason in (
                 ("u", "voltage", "'u' is not calculated"),
                 ("voltage", "u", "'voltage' is not calculated"),
                 ("current", "charge", "'charge' is calculated and cannot be varied"),
@@ -104,7 +104,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
                 vectors = (instance.references([unknown]), one, instance.references([known]), one)
                 status = instance.call(f"Get{kind}Derivative", *vectors, value, one, value, one)
                 assert status == ERROR
-                assert statement in instance.messages[-1]
+                assert reason in instance.messages[-1]
             status = instance.call(f"Get{kind}Derivative", *vectors, value, c_size_t(2), value, one)
             assert status == ERROR
             assert "scalars" in instance.messages[-1]

@@ -59,9 +59,9 @@ def test_experiments_name_files_that_are_there() -> None:
             p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
         }
         assert {*output.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
-        item = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
-        assert item.items() <= output.items()
-        assert item
+        units = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
+        assert units.items() <= output.items()
+        assert units
     one = table[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
@@ -124,8 +124,8 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
-    statement = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
-    assert "documentation/evidence.html (records: short), 8 parameter sets" in statement
+    words = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in words
     table = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
@@ -154,15 +154,15 @@ def messages(
 
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_inside_nothing_is_said(fmi: int) -> None:
-    statement, outside = messages(fmi, 75.0, 0.5, start=1e3)
-    assert statement == []
+    logged, outside = messages(fmi, 75.0, 0.5, start=1e3)
+    assert logged == []
     assert np.all(outside == 0.0)
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
-    statement, outside = messages(fmi, 120.0, 0.6)
-    (line,) = statement
+    logged, outside = messages(fmi, 120.0, 0.6)
+    (line,) = logged
     assert line.startswith("voltage is 7")
     low, high = stated().seen.voltage.low, stated().seen.voltage.high
     assert f"from {low:.6g} to {high:.6g}." in line
@@ -174,13 +174,13 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
 @slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
-    statement, outside = messages(fmi, 75.0, 0.01)
-    assert len(statement) == 1
-    assert statement[0].startswith("The rate per second of voltage is 1")
+    logged, outside = messages(fmi, 75.0, 0.01)
+    assert len(logged) == 1
+    assert logged[0].startswith("The rate per second of voltage is 1")
     assert np.max(outside) > 1.0
-    statement, outside = messages(fmi, 75.0, 0.8)
-    assert len(statement) == 1
-    assert statement[0].startswith("The time since the start is 0.64")
+    logged, outside = messages(fmi, 75.0, 0.8)
+    assert len(logged) == 1
+    assert logged[0].startswith("The time since the start is 0.64")
     assert np.all(outside == 0.0)
 
 

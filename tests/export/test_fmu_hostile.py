@@ -277,14 +277,14 @@ def test_such_an_archive_is_neither_unpacked_nor_run(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "MOST_ENTRIES", 30)
-    change, statement = (NAMES | SIZES)[what]
+    change, remark = (NAMES | SIZES)[what]
     path = _archive(tmp_path / "h.fmu")
     assert not any(archive_problems(path).values())
     with zipfile.ZipFile(path, "a") as archive:
         change(archive)
     report = check_fmu(path)
     row = "archive names" if what in NAMES else "archive size"
-    assert [(r.name, statement in r.remark) for r in report.failures] == [(row, True)]
+    assert [(r.name, remark in r.remark) for r in report.failures] == [(row, True)]
     assert all(r.name.startswith("archive") for r in report.rows)
     assert all(r.remark.isprintable() for r in report.rows)
     for reader in (Archive, SspArchive):
@@ -295,8 +295,8 @@ def test_such_an_archive_is_neither_unpacked_nor_run(
 
 def test_sizes_of_all_entries_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MOST_BYTES", 100)
-    (statement,) = archive_problems(_archive(tmp_path / "h.fmu"))["archive size"]
-    assert "more than 100" in statement
+    (problem,) = archive_problems(_archive(tmp_path / "h.fmu"))["archive size"]
+    assert "more than 100" in problem
 
 
 def _damaged(path: Path, how: str) -> None:

@@ -43,9 +43,9 @@ def _without_version(text: str) -> list[str]:
 
 def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
     path = tmp_path / "PiezoStack.mo"
-    statement = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
-    assert "left out: sensor" in statement
-    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in statement
+    words = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
+    assert "left out: sensor" in words
+    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in words
     expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
     texts = _without_version(path.read_text(encoding="utf-8"))
     diff = "".join(difflib.unified_diff(expected, texts, "accepted", "found", n=1))

@@ -178,8 +178,8 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
-    for history, statement in (("120", "--start-voltage"), ("high", "--history is 'high'")):
-        assert statement in refused(*command, "--history", history)
+    for history, reason in (("120", "--start-voltage"), ("high", "--history is 'high'")):
+        assert reason in refused(*command, "--history", history)
 
 
 @pytest.mark.parametrize(
@@ -207,20 +207,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     psa.write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
     psa.save_model(STACK, made / "plain.json")
     psa.save_model(psa.settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
-    statement = done(
+    words = done(
         "export", "fmu", "--model", made / "plain.json", "-o", made / "m.fmu", *OPTIONS
     ).words
-    assert "start: the start values of the model at 60 V" in statement
+    assert "start: the start values of the model at 60 V" in words
     return made
 
 
 def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
     out = folder / "out.csv"
     files = ("--model", folder / model, "--input", folder / "v.csv", "-o", out)
-    statement = done("simulate", *files, *options).out
+    printed = done("simulate", *files, *options).out
     result = psa.read_record(out).displacement
     assert result is not None
-    return result, next(line for line in statement.splitlines() if line.startswith("start: "))
+    return result, next(line for line in printed.splitlines() if line.startswith("start: "))
 
 
 def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
@@ -232,19 +232,19 @@ def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
         truth = co_simulate(fmu, TIME, inputs, ["displacement"], tolerance=1e-9)[:, 0]
     span = float(np.ptp(truth))
     for model, options in (("plain.json", OPTIONS), ("held.json", [])):
-        result, statement = _simulated(folder, model, *options)
+        result, line = _simulated(folder, model, *options)
         assert np.abs(result - truth).max() < 3e-6 * span, model
-        assert "at 60 V, as an exported FMU has them" in statement
-        assert "step" not in statement
-    relaxed, statement = _simulated(folder, "plain.json")
+        assert "at 60 V, as an exported FMU has them" in line
+        assert "step" not in line
+    relaxed, line = _simulated(folder, "plain.json")
     assert np.abs(relaxed - truth).max() > 0.02 * span
-    assert "settled at 60 V" in statement
-    assert "--start-voltage 60" in statement
-    _, statement = _simulated(folder, "held.json", "--start-voltage", "0")
-    assert "at 0 V" in statement
-    assert "step from there to 60 V" in statement
-    _, statement = _simulated(folder, "held.json", "--history", "120,0")
-    assert "where the history 120,0 V leaves them" in statement
+    assert "settled at 60 V" in line
+    assert "--start-voltage 60" in line
+    _, line = _simulated(folder, "held.json", "--start-voltage", "0")
+    assert "at 0 V" in line
+    assert "step from there to 60 V" in line
+    _, line = _simulated(folder, "held.json", "--history", "120,0")
+    assert "where the history 120,0 V leaves them" in line
 
 
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
