@@ -23,7 +23,9 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.components import BASE
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import PsaError
+from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import STRICT, exported_texts
+from psa_casadi.export.nested import config_text
 from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation.compiler import generate_c
@@ -73,36 +75,6 @@ def write(directory: Path, texts: Mapping[str, str], copied: Iterable[str] = ())
     return directory
 
 
-#: What psa_casadi.export.nested writes of two parts with one wire.
-_NESTED = """
-#define NESTED_PARTS 2
-#define NESTED_WIRES 1
-#define NESTED_SHOWN 1
-#define NESTED_STARTS 1
-#define NESTED_TOKEN "{token}"
-#define NESTED_PLATFORM "linux64"
-#define NESTED_SUFFIX ".so"
-static const struct {
-    const char *folder, *identifier, *token;
-    int lines;
-} NESTED[] = {{"a", "a", "a", 1}, {"b", "b", "b", 0}};
-static const struct {
-    fmi2ValueReference output, input;
-    int from, to;
-} WIRES[] = {{1u, 2u, 0, 1}, {0u, 0u, -1, -1}};
-static const struct {
-    fmi2ValueReference variable;
-    int part;
-} SHOWN[] = {{1u, 1}};
-static const struct {
-    fmi2ValueReference variable;
-    int part;
-    char kind;
-    double value;
-} STARTS[] = {{1u, 1, 'R', 1.0}, {0u, 0, 0, 0.0}};
-"""
-
-
 def write_all(sources: Path) -> list[Work]:
     """Write every source into separate folders; return what is to be compiled.
 
@@ -119,7 +91,11 @@ def write_all(sources: Path) -> list[Work]:
     sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
     config = {"imported_config.h": f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"}
     write(sources / "imported", config, ("imported.c", "imported.h"))
-    write(sources / "nested", {"nested_config.h": _NESTED}, ("nested.c",))
+    nested = config_text(  # of two parts with one wire
+        ['{"a", "a", "a", 1}', '{"b", "b", "b", 0}'], ["{1u, 2u, 0, 1}"], ["{1u, 1}"],
+        ["{1u, 1, 'R', 1.0}"], "{token}", PLATFORMS["x86_64-linux"],
+    )  # fmt: skip
+    write(sources / "nested", {"nested_config.h": nested}, ("nested.c",))
     work = [
         Work(tuple(sorted(folder.glob("*.c"))), (folder, headers))
         for folder in sorted(sources.iterdir())

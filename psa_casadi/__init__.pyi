@@ -35,7 +35,7 @@ from psa_casadi.export.fixed_step.export import CodeExport as CodeExport
 from psa_casadi.export.fixed_step.export import export_c as export_c
 from psa_casadi.export.fmu.archive import export_fmu as export_fmu
 from psa_casadi.export.importer.fmu_model import fmu_model as fmu_model
-from psa_casadi.export.importer.model_with_fmu import load_model as load_model
+from psa_casadi.export.importer.fmu_model import load_model as load_model
 from psa_casadi.export.importer.start_values import save_start_values as save_start_values
 from psa_casadi.export.modelica.package import export_modelica as export_modelica
 from psa_casadi.export.ssp import export_ssp as export_ssp

@@ -18,7 +18,7 @@ from fmpy.model_description import (
 )
 
 from psa_casadi.export.common.markup import generation_tool
-from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.fmu.platforms import Platform, compile_library, host_platform
 from psa_casadi.export.fmu.sources import FMI_HEADERS
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.ssp import OUTSIDE, Port, WiredParts
@@ -32,7 +32,10 @@ _KINDS = {"Integer": "I", "Enumeration": "I", "Boolean": "B"}
 
 @dataclass(frozen=True)
 class _Shown:
-    """A variable of the FMU: which one of a part it is, what it is called, where it starts."""
+    """A variable of the FMU: its name, the part and variable that it is, and its start value.
+
+    The token is a hash of the representation of these, name of the class included.
+    """
 
     name: str
     part: str
@@ -51,16 +54,16 @@ def nested(
     """
     with ExitStack() as held:
         archives = {n: held.enter_context(Archive(fmus[n])) for n in wiring.parts}
-        displayed = _shown(wiring, archives, starts)
+        variables = _variables(wiring, archives, starts)
         digest = hashlib.sha256(
-            repr((displayed, *(f.read_bytes() for f in fmus.values()))).encode()
+            repr((variables, *(f.read_bytes() for f in fmus.values()))).encode()
         )
         token = f"{{{uuid.UUID(digest.hexdigest()[:32])}}}"
         target = host_platform()
         headers = files("fmpy") / "c-code"
         texts = {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[2]}
         texts["nested.c"] = (sources_directory() / "nested.c").read_text(encoding="utf-8")
-        texts["nested_config.h"] = _config(wiring, archives, displayed, token)
+        texts["nested_config.h"] = _config(wiring, archives, variables, token)
         binary = compile_library(texts, _IDENTIFIER, target)
         entries = {f"binaries/{target.binaries(2)}/{_IDENTIFIER}{target.suffix}": binary}
         for name, archive in archives.items():
@@ -68,47 +71,43 @@ def nested(
                 if file.is_file():
                     place = file.relative_to(archive.directory).as_posix()
                     entries[f"resources/{name}/{place}"] = file.read_bytes()
-        entries["modelDescription.xml"] = _description(wiring, archives, displayed, token)
+        entries["modelDescription.xml"] = _description(wiring, archives, variables, token)
         return entries
 
 
-def _shown(
+def _variables(
     wiring: WiredParts, archives: Mapping[str, Archive], starts: Mapping[str, float]
 ) -> list[_Shown]:
     """Return the variables: what is wired outside, and the parameters of every part."""
     items = []
     for wire in wiring.wires:
         if wire.start.part == OUTSIDE:
-            start = _start(archives, wire.end.part, wiring.called(wire.end))
-            items.append(
-                _Shown(wire.start.name, wire.end.part, wiring.called(wire.end), "input", start)
-            )
+            part, inner = wire.end.part, wiring.called(wire.end)
+            start = archives[part].elements[inner].start
+            items.append(_Shown(wire.start.name, part, inner, "input", start))
         elif wire.end.part == OUTSIDE:
-            items.append(
-                _Shown(wire.end.name, wire.start.part, wiring.called(wire.start), "output")
-            )
+            part, inner = wire.start.part, wiring.called(wire.start)
+            items.append(_Shown(wire.end.name, part, inner, "output"))
     for name, archive in archives.items():
         for v in archive.description.modelVariables:
             if v.causality == "parameter" and v.type in ("Real", *_KINDS):
-                start = starts.get(v.name, _start(archives, name, v.name))
-                item = v.name if v.name not in [f.name for f in items] else f"{name}.{v.name}"
-                items.append(_Shown(item, name, v.name, "parameter", start))
+                start = starts.get(v.name, archive.elements[v.name].start)
+                free = v.name if v.name not in [f.name for f in items] else f"{name}.{v.name}"
+                items.append(_Shown(free, name, v.name, "parameter", start))
     inputs = {f.variable for f in items if f.causality == "input"}
     others = [n for n in archives["original"].names("input") if n in starts and n not in inputs]
     items += [_Shown(n, "original", n, "input", starts[n]) for n in others]
     return items
 
 
-def _start(archives: Mapping[str, Archive], part: str, name: str) -> float:
-    element = archives[part].elements[name]
-    return element.starts[element.place]
-
-
 def _config(
-    wiring: WiredParts, archives: Mapping[str, Archive], displayed: list[_Shown], token: str
+    wiring: WiredParts, archives: Mapping[str, Archive], variables: list[_Shown], token: str
 ) -> str:
-    """Return nested_config.h."""
-    order, target = list(archives), host_platform()
+    """Return nested_config.h of parts that are wired."""
+    order = list(archives)
+
+    def variable(part: str, name: str) -> str:
+        return f"{{{archives[part].references[name]}u, {order.index(part)}"
 
     def reference(port: Port) -> int:
         return archives[port.part].references[wiring.called(port)]
@@ -117,21 +116,31 @@ def _config(
         f'{{"{n}", "{a.identifier}", "{a.token}", {int(_takes_lines(a))}}}'
         for n, a in archives.items()
     ]
-    inner = [w for w in wiring.wires if OUTSIDE not in (w.start.part, w.end.part)]
     wires = [
         f"{{{reference(w.start)}u, {reference(w.end)}u, {order.index(w.start.part)},"
         f" {order.index(w.end.part)}}}"
-        for w in inner
+        for w in wiring.wires
+        if OUTSIDE not in (w.start.part, w.end.part)
     ]
-    places = [
-        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)}}}" for f in displayed
-    ]
+    places = [variable(f.part, f.variable) + "}" for f in variables]
     starts = [
-        f"{{{archives[f.part].references[f.variable]}u, {order.index(f.part)},"
+        f"{variable(f.part, f.variable)},"
         f" '{_KINDS.get(archives[f.part].elements[f.variable].type, 'R')}', {f.start!r}}}"
-        for f in displayed
+        for f in variables
         if f.start is not None
     ]
+    return config_text(parts, wires, places, starts, token, host_platform())
+
+
+def config_text(
+    parts: list[str],
+    wires: list[str],
+    places: list[str],
+    starts: list[str],
+    token: str,
+    target: Platform,
+) -> str:
+    """Return nested_config.h with the initializers of its arrays."""
     sizes = {"PARTS": parts, "WIRES": wires, "SHOWN": places, "STARTS": starts}
     return "".join(
         [
@@ -157,11 +166,11 @@ def _takes_lines(archive: Archive) -> bool:
 
 
 def _description(
-    wiring: WiredParts, archives: Mapping[str, Archive], displayed: list[_Shown], token: str
+    wiring: WiredParts, archives: Mapping[str, Archive], listed: list[_Shown], token: str
 ) -> bytes:
     """Return modelDescription.xml, as fmpy writes it."""
     variables: list[Any] = []
-    for k, f in enumerate(displayed):
+    for k, f in enumerate(listed):
         of = archives[f.part].variables[f.variable]
         real, start = of.type == "Real", None if f.start is None else repr(f.start)
         if start is not None and not real:

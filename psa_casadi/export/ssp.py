@@ -33,7 +33,7 @@ from psa_casadi.variables import Publication
 
 Point = tuple[float, float]
 
-#: Name of the system itself where the name of a part is asked for.
+#: Name of the system itself in the place of the name of a part.
 OUTSIDE = ""
 
 _PITCH, _TITLE, _GAP, _CHAR, _EDGE = 8.0, 12.0, 6.0, 2.0, 12.0
@@ -57,7 +57,7 @@ class Wire:
 
 @dataclass(frozen=True)
 class WiredParts:
-    """A system as SSP sees it: models by the names of the parts, wires, and its own ports.
+    """A system as SSP has it: models by the names of the parts, wires, and the system's ports.
 
     A wire from or to `OUTSIDE` makes a port of the system, with the unit of the part's port.
     `names` are other names of ports in their FMU.
@@ -126,7 +126,7 @@ class Layout:
 
 
 def layout_of(wiring: WiredParts) -> Layout:
-    """Return the drawing of a system: its parts in a row, ports of its own level with a wire."""
+    """Return the drawing of a system: its parts in a row, the system's ports level with a wire."""
     routes, counts = _routes(wiring)
     boxes = _boxes(wiring, counts)
     width = boxes[-1].x2 + _EDGE + _GAP + _PITCH / 2 * counts[-1]
@@ -241,7 +241,7 @@ def _figure(wiring: WiredParts, layout: Layout) -> Figure:
     axes.set_ylim(bottom, bottom + height)
     axes.set_axis_off()
     order = {b.name: k for k, b in enumerate(layout.boxes)}
-    for w, path in zip(wiring.wires, layout.paths, strict=True):  # what leads back stands out
+    for w, path in zip(wiring.wires, layout.paths, strict=True):  # feedback has its colour
         back = order.get(w.end.part, len(order)) <= order.get(w.start.part, -1)
         axes.plot(*zip(*path, strict=True), color=_FEEDBACK if back else _LANE, linewidth=1.4)
     style: dict[str, Any] = {"va": "center", "color": _INK, "zorder": 4}
@@ -293,7 +293,7 @@ def structure_description(
 ) -> str:
     """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`.
 
-    SSP 1.0 has no place for a communication step: `step` [s] stands in an annotation that
+    SSP 1.0 has no place for a communication step: `step` [s] is in an annotation that
     OMSimulator reads, and without which it opens no archive. A SystemGeometry is one that it
     refuses; without it the drawing extends over all elements, as the standard has it.
     """
@@ -305,8 +305,7 @@ def structure_description(
         layout=layout,
         bindings=bindings,
         published={
-            _PUBLISHED.get(name, name): statement
-            for name, statement in wiring.publication.stated.items()
+            _PUBLISHED.get(name, name): text for name, text in wiring.publication.stated.items()
         },
         tool=markup.generation_tool(),
         about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
@@ -443,7 +442,7 @@ def linear(wiring: WiredParts) -> Linear:
 def stable_step(wiring: WiredParts, *, rates: bool) -> float:
     """Return the longest communication step [s] up to which all shorter ones are stable.
 
-    `rates` says whether inputs get slopes. Infinity if no loop turns unstable: at up to 100 times
+    With `rates` inputs have slopes. Infinity if no loop turns unstable: at up to 100 times
     the time of the slowest ordinary mode.
     """
     system = linear(wiring)
@@ -494,8 +493,8 @@ def export_ssp(
 
     The archive holds `SystemStructure.ssd` with units, connectors, wires and their drawing; in
     `resources` the FMU of each part and the parameter sets; the picture of the wiring as SVG. The
-    same system gives the same bytes. `platforms` are those of `export_fmu`. `publication` says who
-    made the system and on what terms it is passed on; a part that says nothing of it says the same.
+    same system gives the same bytes. `platforms` are those of `export_fmu`. `publication` is
+    who made the system and on what terms it is passed on, also for parts that state neither.
 
     Raises what `connect` and `export_fmu` raise.
     """
@@ -507,23 +506,32 @@ def export_ssp(
             for name, part in wiring.parts.items()
         }
         wiring = replace(wiring, parts=parts, publication=publication)
-    layout = layout_of(wiring)
-    entries, bindings = parameter_files(wiring.parts, wiring.name)
-    description = structure_description(
-        wiring, layout, bindings, stop_time, master_step(wiring, stop_time)
-    )
-    entries["SystemStructure.ssd"] = description.encode("utf-8")
-    entries[PICTURE_ENTRY] = wiring_picture(wiring, layout, "svg")
+    files, bindings = parameter_files(wiring.parts, wiring.name)
+    entries = system_entries(wiring, bindings, stop_time, master_step(wiring, stop_time)) | files
     with temporary_folder() as folder:
         for name, model in wiring.parts.items():
-            fmu = export_fmu(
-                model, folder / f"{name}.fmu", name=name, include_sensor=True,
-                platforms=platforms,
-            )  # fmt: skip
-            entries[f"resources/{name}.fmu"] = fmu.read_bytes()
+            entries[f"resources/{name}.fmu"] = part_fmu(model, name, folder, platforms).read_bytes()
     with atomic_path(path) as temporary:
         write_archive(temporary, entries)
     return Path(path)
+
+
+def system_entries(
+    wiring: WiredParts, bindings: Sequence[Binding], stop_time: float, step: float
+) -> dict[str, bytes]:
+    """Return the description of a system and the picture of its wiring by place in the archive."""
+    layout = layout_of(wiring)
+    text = structure_description(wiring, layout, bindings, stop_time, step)
+    return {
+        "SystemStructure.ssd": text.encode("utf-8"),
+        PICTURE_ENTRY: wiring_picture(wiring, layout, "svg"),
+    }
+
+
+def part_fmu(model: Model, name: str, folder: Path, platforms: Sequence[str]) -> Path:
+    """Write the FMU of a part into a folder and return its path."""
+    path = folder / f"{name}.fmu"
+    return export_fmu(model, path, name=name, include_sensor=True, platforms=platforms)
 
 
 def wiring_of(system: System) -> WiredParts:

@@ -70,10 +70,10 @@ def web_module(model: Model) -> bytes:
     return _compiled(model.structure)()
 
 
-def begun_module(model: Model) -> "Future[bytes | None]":
-    """Compile a model's module beside other work; the result is None where there is none.
+def future_module(model: Model) -> "Future[bytes | None]":
+    """Compile a model's module in a thread; the result is None where there is none.
 
-    The log then says why, unless the compiler is not installed.
+    The log has the reason, unless the compiler is not installed.
     """
     nothing: Future[bytes | None] = Future()
     nothing.set_result(None)
@@ -96,7 +96,7 @@ def begun_module(model: Model) -> "Future[bytes | None]":
 
 @cache
 def _compiled(structure: Structure) -> Callable[[], bytes]:
-    """Return what gives the module's bytes, once its text is there or it is found in the cache."""
+    """Return the function that returns the module's bytes: from the cache, or compiled."""
     if structure.sampled:
         names = ", ".join(s.name for s in structure.sampled)
         raise InputError(
@@ -118,11 +118,11 @@ def module_texts(structure: Structure) -> Mapping[str, str]:
     """Return the generated files of a module by their names."""
     s = structure
     outputs = [o.name for o in s.outputs]
-    displayed, split = next((n for n in SHOWN if n in outputs), None), split_of(s)
+    output, split = next((n for n in SHOWN if n in outputs), None), split_of(s)
     exact = {}
-    if displayed is not None and not isinstance(split, str):
+    if output is not None and not isinstance(split, str):
         with suppress(Unprintable):  # then it takes no exact steps
-            exact["exact_model.h"] = generate(split, (displayed,))
+            exact["exact_model.h"] = generate(split, (output,))
     by_input = ca.Function(
         "psa_by_input", c_arguments(s), [ca.densify(ca.jacobian(c_slopes(s), s.u))], {"cse": True}
     )

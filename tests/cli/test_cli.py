@@ -27,7 +27,7 @@ from psa_casadi.datasets import DATASETS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
 from psa_casadi.export.check.check import CheckReport, CheckRow
-from psa_casadi.export.importer.model_with_fmu import load_model
+from psa_casadi.export.importer.fmu_model import load_model
 from psa_casadi.identification import identify
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.model_file import save_model

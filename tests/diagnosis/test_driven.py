@@ -14,7 +14,7 @@ from psa_casadi.diagnosis.diagnose import filtered
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
-from psa_casadi.export.importer.model_with_fmu import load_model
+from psa_casadi.export.importer.fmu_model import load_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import write_record
 from psa_casadi.records.record import Record

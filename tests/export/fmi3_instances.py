@@ -12,7 +12,7 @@ from tests.export.fmu_models import exported
 
 
 class Update(NamedTuple):
-    """What the FMU says between two steps of its solver."""
+    """The arguments of the callback between two steps of the FMU's solver."""
 
     time: float
     set_requested: bool
@@ -42,7 +42,7 @@ def loaded(name: str) -> Fmu:
 
 
 def try_step(instance: Instance, point: float, size: float) -> Step:
-    """Do one communication step and return all it says, the status included."""
+    """Do one communication step and return all its results, the status included."""
     event, end, early, reached = c_bool(), c_bool(), c_bool(), c_double()
     places = (ctypes.byref(v) for v in (event, end, early, reached))
     status = instance.call("DoStep", point, size, True, *places)
@@ -81,7 +81,7 @@ class Instance3(importer.Instance):
         return self
 
     def try_step(self, point: float, size: float) -> Step:
-        """Do one communication step and return all it says, the status included."""
+        """Do one communication step and return all its results, the status included."""
         return try_step(self, point, size)
 
     def try_set(self, values: Mapping[str, float]) -> int:
@@ -92,17 +92,17 @@ class Instance3(importer.Instance):
 
     def serialized(self) -> bytes:
         """Return the instance's state as bytes."""
-        snapshot = self.save()
-        data = self.serialize(snapshot)
-        self.drop(snapshot)
+        snapshot = self.fmi.getFMUState()
+        data: bytes = self.fmi.serializeFMUState(snapshot)
+        self.fmi.freeFMUState(snapshot)
         return data
 
     def try_restore(self, data: bytes) -> int:
-        """Go to a state given as bytes; return the status of the first call that fails."""
+        """Go to a state from bytes; return the status of the first call that fails."""
         try:
-            snapshot = self.deserialize(data)
+            snapshot = self.fmi.deserializeFMUState(data)
         except importer.FmuError as error:
             return error.status
         status = self.call("SetFMUState", snapshot)
-        self.drop(snapshot)
+        self.fmi.freeFMUState(snapshot)
         return status

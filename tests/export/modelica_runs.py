@@ -13,7 +13,7 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.units import FloatArray
 
 _SAMPLES = 200
-#: The connectors and parts of Modelica's library that the wired example names, in our own words.
+#: The connectors and parts of Modelica's library that the wired example names, as stubs.
 STUB = Path(__file__).with_name("modelica_stub.mo").read_text("utf-8")
 
 
@@ -108,7 +108,7 @@ def right_side_error(model: psa.Model, text: str, points: int = 5) -> float:
         inputs |= dict(zip(model.input_names, u, strict=True))
         inputs |= {f"integral_{n}": 0.0 for n in model.output_names}
         names = (read.state_names, read.input_names, read.parameter_names)
-        rates = np.array(read.rhs(time, *([inputs[n] for n in item] for item in names))).ravel()
+        rates = np.array(read.rhs(time, *([inputs[n] for n in listed] for listed in names))).ravel()
         got = dict(zip(read.state_names, rates, strict=True))
         left = [*model.state_names, *(f"integral_{n}" for n in model.output_names)]
         right = np.concatenate([np.array(v).ravel() for v in expected])

@@ -1,6 +1,6 @@
 """A master of SSP archives: all FMUs of a system stepped side by side (Jacobi's scheme).
 
-fmpy's own passes values on after a step only, and reads no parameter sets. Here, at every
+fmpy's passes values on after a step only, and reads no parameter sets. Here, at every
 communication point, the parts exchange their outputs in the order in which outputs depend on
 inputs, so that all values belong to that point. Over the step that follows each part sees its
 inputs held (an error of first order in the step) or, with `rates`, as straight lines whose slopes
@@ -22,7 +22,7 @@ from fmpy.ssp.ssd import read_ssd
 
 from psa_casadi.export.importer.archive import unpack
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp import OUTSIDE, Port, Wire
 from psa_casadi.files import temporary_folder
 from psa_casadi.units import FloatArray
@@ -123,7 +123,7 @@ def couple(
 ) -> FloatArray:
     """Simulate a system over communication points `times` (n,); return its outputs (n, ny).
 
-    `inputs` are the system's; those not given keep their start values. Parameters are those of
+    `inputs` are the system's; the others keep their start values. Parameters are those of
     the archive's parameter sets, but for `values` by "part.parameter". `tolerance` is the relative
     tolerance inside each part.
 
@@ -132,7 +132,7 @@ def couple(
     origins = [archive.origin(name) for name in outputs]
     outer = [w for w in archive.wires if w.start.part == OUTSIDE and w.start.name in inputs.names]
     inner, columns = archive.inner_wires(), dict(zip(inputs.names, inputs.at(times).T, strict=True))
-    starts = {name: dict(item) for name, item in archive.parameters.items()}
+    starts = {name: dict(listed) for name, listed in archive.parameters.items()}
     table = {
         **(values or {}),
         **{f"{w.end.part}.{w.end.name}": columns[w.start.name][0] for w in outer},

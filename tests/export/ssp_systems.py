@@ -60,8 +60,8 @@ def monolithic() -> tuple[FloatArray, FloatArray]:
         tip = np.array(f(t, z[:count], [_voltage(t), 0.0], p)[1]).ravel()[at]
         slope, out = g(t, z[count:], tip, q)
         force = float(out[flexure.output_names.index("reaction_force")])
-        item = f(t, z[:count], [_voltage(t), force], p)[0]
-        return np.concatenate([np.array(item).ravel(), np.array(slope).ravel()])
+        slopes = f(t, z[:count], [_voltage(t), force], p)[0]
+        return np.concatenate([np.array(slopes).ravel(), np.array(slope).ravel()])
 
     size = np.concatenate([stack.state_nominals(), flexure.state_nominals()])
     solution = solve_ivp(

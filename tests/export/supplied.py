@@ -64,9 +64,9 @@ def bounces(g: float, e: float, times: FloatArray) -> FloatArray:
 def main() -> None:
     """Write what docs/howto/fmu.md takes for granted: tank.fmu, run.csv and plant.fmu."""
     Path("tank.fmu").write_bytes(supplied("tank").read_bytes())
-    displayed = lagged(level(0.7, 0.01), 3.0)
-    displayed += 1e-3 * np.random.default_rng(1).standard_normal(len(TIMES))
-    columns = [TIMES, INFLOW, np.ones(len(TIMES)), displayed]
+    measured = lagged(level(0.7, 0.01), 3.0)
+    measured += 1e-3 * np.random.default_rng(1).standard_normal(len(TIMES))
+    columns = [TIMES, INFLOW, np.ones(len(TIMES)), measured]
     head = "time,inflow,valve,level"
     np.savetxt("run.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
     speed, torque = ca.SX.sym("speed"), ca.SX.sym("torque")

@@ -1,6 +1,6 @@
 """The fixed step in C: its error, its form, what it refuses, and the command that writes it.
 
-Beyond the rated voltage it is as good as it says, or limited and told.
+Beyond the rated voltage it is as good as stated, or limited, with a flag.
 """
 
 import ctypes
@@ -32,8 +32,7 @@ from psa_casadi.export.fmu.documentation import ENTRY as DOCUMENTATION_ENTRY
 from psa_casadi.export.fmu.sources import FIXED_ENTRY
 from psa_casadi.export.fmu.sources import STRICT as AS_EXPORTED
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
-from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.simulation.compiler import (
@@ -67,16 +66,16 @@ def made(precision: str = "double", step: float = STEP) -> FixedStep:
     return fixed_step(model, name="stack", step=step, precision=precision, substeps=substeps)
 
 
-def play(found: FixedStep, voltage: FloatArray) -> FloatArray:
+def play(fixed: FixedStep, voltage: FloatArray) -> FloatArray:
     """Return the displacement after each step of voltages (n,), the first one the start's."""
-    model = found.plan.model
+    model = fixed.plan.model
     u = played_inputs(model, np.zeros(len(voltage)))
     u[:, model.input_names.index("voltage")] = voltage
-    return Probe(found.plan, found.texts).play(u)[:, model.output_names.index(OUTPUT)]
+    return Probe(fixed.plan, fixed.texts).play(u)[:, model.output_names.index(OUTPUT)]
 
 
-def errors(found: FixedStep) -> dict[str, float]:
-    return {e.voltage: e.error for e in found.errors}
+def errors(fixed: FixedStep) -> dict[str, float]:
+    return {e.voltage: e.error for e in fixed.errors}
 
 
 def test_the_base_errs_by_what_its_header_says() -> None:
@@ -106,9 +105,9 @@ def test_the_code_has_no_warnings_no_library_but_math_and_no_loop(precision: str
         '"stack.h"',
         "<math.h>",
     ]
-    item = {"advance", "outputs", "gain", "stack_init", "stack_step"}
+    functions = {"advance", "outputs", "gain", "stack_init", "stack_step"}
     code = re.sub(r"/\*.*?\*/", "", source, flags=re.DOTALL)
-    assert set(re.findall(r"(\w+)\(", code)) <= item | {name + suffix for name in CALLS}
+    assert set(re.findall(r"(\w+)\(", code)) <= functions | {name + suffix for name in CALLS}
     assert not re.search(r"\b(for|while|do|if|goto|static \w+ \w+\[)\b", code)
     commands = [compiler_command(), *([zig_command()] if has_zig() else [])]
     with temporary_folder() as folder:
@@ -150,7 +149,7 @@ def test_a_sampled_part_acts_at_its_period() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "match"),
     [
         ({"name": "2x"}, "cannot name functions"),
         ({"step": 0.0}, "above 0"),
@@ -161,10 +160,10 @@ def test_a_sampled_part_acts_at_its_period() -> None:
         ({"step": 2e-3, "substeps": 1}, "too\\s+long"),
     ],
 )
-def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], said: str) -> None:
+def test_wrong_wishes_end_in_a_sentence(wrong: dict[str, object], match: str) -> None:
     table = {"name": "stack", "step": STEP, **wrong}
     model = with_effect("backlash") if "substeps" in wrong else stack("P-885.51")
-    with pytest.raises(psa.InputError, match=said):
+    with pytest.raises(psa.InputError, match=match):
         fixed_step(model, **table)  # type: ignore[arg-type]  # wrong on purpose
 
 
@@ -176,7 +175,7 @@ def test_a_step_has_its_unit(text: str, seconds: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "match"),
     [
         ("10", r"'10', without a unit; type --step 10s or 10ms or 10us\.$"),
         ("1e-5", "type --step 1e-5s or 1e-5ms"),
@@ -185,8 +184,8 @@ def test_a_step_has_its_unit(text: str, seconds: float) -> None:
         ("1.2.3us", "a number with a unit"),
     ],
 )
-def test_the_unit_of_a_step_is_never_guessed(text: str, said: str) -> None:
-    with pytest.raises(psa.InputError, match=said):
+def test_the_unit_of_a_step_is_never_guessed(text: str, match: str) -> None:
+    with pytest.raises(psa.InputError, match=match):
         step_seconds(text)
 
 
@@ -216,7 +215,7 @@ def test_every_effect_and_every_stack_is_exported_and_compared() -> None:
 
 
 LONG_STEP = 1e-4
-TOLD = (HERE / "told.c").read_text("utf-8")
+LIMITED = (HERE / "told.c").read_text("utf-8")
 
 
 def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
@@ -228,8 +227,8 @@ def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
     t, u = LONG_STEP * np.arange(401, dtype=np.float64), np.column_stack([jumps, 0.0 * jumps])
     true = psa.run(model, t, u, np.zeros(len(model.state_names)), rtol=1e-10).y
     within = play(result, jumps)
-    displayed = true[1:, model.output_names.index(OUTPUT)]
-    assert error(within, displayed) <= max(GOOD, result.worst.error)
+    truth = true[1:, model.output_names.index(OUTPUT)]
+    assert error(within, truth) <= max(GOOD, result.worst.error)
     for beyond in (1.001, 900.0 / limit, 1e9, 1e305):
         assert np.array_equal(play(result, beyond * jumps), within)
 
@@ -237,17 +236,17 @@ def test_up_to_the_limit_it_is_good_and_beyond_it_stays_there() -> None:
 @pytest.mark.parametrize("precision", ["double", pytest.param("single", marks=slow)])
 def test_the_step_tells_it_and_no_number_leaves_the_voltage(precision: str) -> None:
     result = made(precision, LONG_STEP)
-    library = ctypes.CDLL(str(shared_library({**result.texts, "told.c": TOLD}, ())))
+    library = ctypes.CDLL(str(shared_library({**result.texts, "told.c": LIMITED}, ())))
     assert "Returns 1 if the voltage was beyond" in " ".join(result.texts["stack.h"].split())
 
-    def told(*voltage: float) -> tuple[int, float]:
+    def limited(*voltage: float) -> tuple[int, float]:
         x = ctypes.c_double()
         inputs = (ctypes.c_double * len(voltage))(*voltage)
         return library.told(inputs, len(voltage), ctypes.byref(x)), x.value
 
-    assert told(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
-    assert told(60.0, 60.0, np.nan) == (0b001, told(60.0, 60.0, 60.0)[1])
-    assert told(60.0, np.inf)[1] == told(60.0, result.plan.limit)[1]
+    assert limited(0.0, 100.0, 900.0, 100.0, -900.0)[0] == 0b00101
+    assert limited(60.0, 60.0, np.nan) == (0b001, limited(60.0, 60.0, 60.0)[1])
+    assert limited(60.0, np.inf)[1] == limited(60.0, result.plan.limit)[1]
 
 
 PERIOD, SAMPLES = 1e-4, 40_000
@@ -269,7 +268,7 @@ def played(model: psa.Model, precision: str, inputs: FloatArray) -> FloatArray:
 
 @cache
 def values() -> dict[str, float]:
-    """Return a stack's values; without delta, by which a slow ramp is told from its stairs."""
+    """Return a stack's values; without delta, by which a slow ramp differs from its stairs."""
     return psa.stack_values(psa.stack_model("P-885.51").with_values({"delta": 0.0}), PERIOD)
 
 
@@ -451,7 +450,7 @@ def test_the_description_says_what_it_is(fmi: int, tmp_path: Path) -> None:
 
 @slow
 def test_the_check_finds_the_errors_that_it_states(tmp_path: Path) -> None:
-    """On the voltages behind them; what means nothing there is left out, and said."""
+    """On the voltages behind them; what means nothing there is left out, and named."""
     fmi = 3
     path = written(fmi, tmp_path)
     report = psa.check_fmu(path)

@@ -25,7 +25,7 @@ INSTRUCTIONS_PER_TICK = 40.0 / 32.0
 LIMITS = {"double": 1e-12, "single": 2e-6}
 
 
-#: What moves in units of so much, what is shown, and the most instructions in single precision.
+#: What moves in which units, the output, and the most instructions in single precision.
 CASES = {
     "stack": ("voltage", "displacement", 1.0, 5_000),
     "position_controller": ("reference", "command", 2.0**-24, 200),
@@ -37,7 +37,7 @@ STEP = 1e-5
 
 
 @cache
-def found(name: str, precision: str) -> FixedStep:
+def fixed(name: str, precision: str) -> FixedStep:
     model = stack("P-885.51")
     made = model.plant() if name == "stack" else psa.part_for(name, model, period=STEP)
     return fixed_step(made, name="stack", step=STEP, precision=precision)
@@ -51,12 +51,12 @@ def moving() -> FloatArray:
 
 
 def on_the_board(name: str, precision: str, folder: Path) -> tuple[FloatArray, FloatArray]:
-    """Return what is shown after each step and the instructions that it took, (n,) each."""
+    """Return the output after each step and the instructions that it took, (n,) each."""
     qemu = tool("qemu-system-arm")
-    for file, text in found(name, precision).texts.items():
+    for file, text in fixed(name, precision).texts.items():
         (folder / file).write_text(text, encoding="utf-8")
-    inputs, displayed, size, _ = CASES[name]
-    items = [f"-DGIVEN={inputs}", f"-DSHOWN={displayed}", f"-DSIZE={size!r}f"]
+    inputs, output, size, _ = CASES[name]
+    items = [f"-DGIVEN={inputs}", f"-DSHOWN={output}", f"-DSIZE={size!r}f"]
     target = ["-target", "thumb-freestanding-eabihf", "-mcpu=cortex_m4+vfp4d16sp"]
     flags = ["-std=c99", "-O2", "-fno-math-errno", "-g0"]
     places = [f"-I{HERE}", "-I.", str(HERE / "board.c"), "stack.c"]
@@ -83,12 +83,12 @@ def test_a_cortex_m4_gives_the_same_numbers_at_constant_cost(
     name: str, precision: str, tmp_path: Path
 ) -> None:
     board, instructions = on_the_board(name, precision, tmp_path)
-    inputs, displayed, size, most = CASES[name]
-    step = found(name, precision)
+    inputs, output, size, most = CASES[name]
+    step = fixed(name, precision)
     model = step.plan.model
     u = played_inputs(model, np.zeros(STEPS + 1))
     u[:, model.input_names.index(inputs)] = size * moving()
-    host = Probe(step.plan, step.texts).play(u)[:, model.output_names.index(displayed)]
+    host = Probe(step.plan, step.texts).play(u)[:, model.output_names.index(output)]
     assert np.ptp(host) > 5e-6
     assert np.max(np.abs(board - host)) <= LIMITS[precision] * np.ptp(host)
     print(f"{name}, {precision}: {instructions.mean():.0f} instructions, {instructions.max():.0f}")

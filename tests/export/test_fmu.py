@@ -79,8 +79,8 @@ def _without_outputs() -> psa.Model:
     return psa.compose([tank], name="tank")
 
 
-def _seen_late() -> psa.Model:
-    """A first-order model whose output is seen through a lag."""
+def _with_lag() -> psa.Model:
+    """A first-order model whose output has a lag."""
     model = _ode("late", u=_U, p=_P, ode=_P * (_U - _X), y=_X)
     ones = dict.fromkeys((*model.state_names, *model.input_names, *model.output_names), 1.0)
     sizes = Sizes(ones, ones, sample=0.01, duration=1.0)
@@ -117,8 +117,8 @@ def test_an_unusual_model_passes_the_check(name: str, fmi: int, tmp_path: Path) 
 
 
 def test_a_sensors_effect_is_left_out_where_the_fmu_leaves_it_out(tmp_path: Path) -> None:
-    """It has no output of its own: its state and parameters tell."""
-    whole = _seen_late()
+    """It has no output, but a state and parameters."""
+    whole = _with_lag()
     assert whole.state_names != ("x",)
     with Archive(psa.export_fmu(whole, tmp_path / "m.fmu")) as archive:
         chosen = as_exported(archive, whole)

@@ -1,7 +1,7 @@
 """The FMU keeps the tolerance that its importer asks for, whatever input, step and start.
 
 Errors are shares of the output's range, or of its nominal where that is larger (a stack that hardly
-moves is not asked for more digits than its absolute tolerance holds)."""
+moves is compared to the digits of its absolute tolerance)."""
 
 from functools import cache
 from itertools import pairwise
@@ -13,8 +13,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, Fmu, FmuError
-from psa_casadi.export.importer.masters import co_simulate, communicate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
 from psa_casadi.reference import simulate
 from psa_casadi.units import FloatArray
 from psa_casadi.variables import nominal_value
@@ -156,7 +155,7 @@ def test_output_derivatives_are_those_of_the_outputs(name: str) -> None:
 
 
 def test_every_solver_step_gets_a_share_of_the_tolerance() -> None:
-    """The work that the bench tells is that of the FMU: as many steps as the simulator's."""
+    """The bench counts the work of the FMU: as many steps as the simulator's."""
     name, tolerance = "P-885.51", 1e-5
     times, inputs = GRID, _signals(name, "sampled")
     with Fmu(exported(name)) as fmu, fmu.start(CO_SIMULATION, tolerance=tolerance) as instance:

@@ -1,6 +1,6 @@
 """What is inside an FMU: sources that compile alone, binaries that load, terminals, icons, pages.
 
-And what the check says of FMUs that another version of CasADi made.
+And the check of FMUs that another version of CasADi made.
 """
 
 import html
@@ -43,7 +43,7 @@ from psa_casadi.export.fmu.reference_run import (
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.model_file import save_model
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError
@@ -108,8 +108,8 @@ def test_a_binary_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     }
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.version", lambda _: "99")
     result.add(compile_library(texts, "psa", linux))
-    item = replace(linux, target=None)  # a machine's own compiler may change without a new name
-    result |= {compile_library(texts, "psa", item) for _ in range(2)}
+    native = replace(linux, target=None)  # a machine's compiler may change without a new name
+    result |= {compile_library(texts, "psa", native) for _ in range(2)}
     assert len(result) == len(calls) == 7
 
 
@@ -167,7 +167,7 @@ def test_an_export_of_another_casadi_is_reproducible(older: Path) -> None:
     assert f"CasADi {NOW}" in row.remark
 
 
-#: What is changed in it, and what the row says then.
+#: What is changed in it, and the remark of the row then.
 CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
     "equation": ("sources/model.c", lambda t: t.replace(b"b0", b"c0", 1), "the token is"),
     "version": ("sources/model.c", lambda t: t.replace(b"3.7.9", NOW.encode()), "model.c differs"),
@@ -180,10 +180,10 @@ CHANGES: dict[str, tuple[str, Callable[[bytes], bytes], str]] = {
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize("change", slow_but(["equation", "start value"], CHANGES))
 def test_a_change_of_it_is_found(change: str, older: Path, tmp_path: Path) -> None:
-    place, edit, statement = CHANGES[change]
+    place, edit, remark = CHANGES[change]
     row = _reproducible(rewritten(older, tmp_path / "changed.fmu", {place: edit}))
     assert not row.passed
-    assert statement in row.remark
+    assert remark in row.remark
 
 
 flexure = psa.compose([psa.COMPONENTS["flexure"]], name="flexure")
@@ -237,9 +237,9 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
         assert 0 <= top < top + height <= SIDE
         colour = [int(r.attrib["fill"][k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
         expected[top : top + height, left : left + width] = [*colour, 1.0]
-    observed = expected[..., 3] > 0.0
-    assert np.array_equal(picture[..., 3] > 0.0, observed)
-    assert picture[observed] == pytest.approx(expected[observed], abs=1e-6)
+    covered = expected[..., 3] > 0.0
+    assert np.array_equal(picture[..., 3] > 0.0, covered)
+    assert picture[covered] == pytest.approx(expected[covered], abs=1e-6)
 
 
 # Documentation
@@ -248,17 +248,17 @@ def test_icons_show_the_same_as_png_and_as_svg(name: str) -> None:
 @pytest.mark.parametrize("model", [psa.stack_model(STACK), flexure, every_effect])
 def test_documentation_is_complete(model: psa.Model) -> None:
     page = documentation(model)
-    statement = html.unescape(re.sub(r"<[^>]*>", "\n", page))
+    words = html.unescape(re.sub(r"<[^>]*>", "\n", page))
     for component in model.components:
         for text in (component.name, component.description, component.equation_text):
-            assert text in statement, component.name
-        assert component.source in statement
+            assert text in words, component.name
+        assert component.source in words
     for declared in variable_table(model):
         if declared.kind in ("parameter", "input", "output", "state"):
             assert f"<td>{declared.name}</td>" in page
-            assert declared.description in statement
+            assert declared.description in words
     for switch in model.structure.switches:
-        assert f"switch.{switch}" in statement
+        assert f"switch.{switch}" in words
 
 
 def test_documentation_stands_alone() -> None:
@@ -331,8 +331,8 @@ def test_manifest_lists_every_file_as_the_schema_of_the_standard_has_it(fmi: int
         assert set(related.attrib) == {"type", "source", "role", "description"}
         assert path in inside
         roles[path] = related.attrib["role"]
-    item = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
-    assert set(roles) == {*item, NOTES}
+    files = {n for n in inside if n.startswith(FOLDER)} - {f"{FOLDER}/fmi-ls-manifest.xml"}
+    assert set(roles) == {*files, NOTES}
     assert roles[f"{FOLDER}/{EXPERIMENTS}"] == "experiment/smoke-test"
     assert roles[f"{FOLDER}/{PARAMETERS}"] == "parameter"
     assert roles[f"{FOLDER}/{OUTPUTS}"] == "result"
@@ -378,7 +378,7 @@ def test_a_model_that_cannot_be_simulated_is_exported_without_a_run(
     assert all(link.removeprefix("../") in names for link in re.findall(r'href="([^"]*)"', page))
 
 
-SAID = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
+TERMS = Publication("A. Author", "1.2", "(c) 2026 A. Author & sons", "CC-BY-4.0")
 LICENSE = (Path(__file__).parents[2] / "LICENSE").read_text(encoding="utf-8")
 
 
@@ -405,7 +405,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
     plain, path = tmp_path / "model.json", tmp_path / "m.fmu"
     model = replace(model_named("flexure"), publication=Publication(author="file", version="0.9"))
     save_model(model, plain)
-    options = ["--author", SAID.author, "--copyright", SAID.copyright, "--license", SAID.license]
+    options = ["--author", TERMS.author, "--copyright", TERMS.copyright, "--license", TERMS.license]
     command = ("export", "fmu", "--model", plain, "--fmi", str(fmi), "-o", path)
     done(*command, *options)
     with zipfile.ZipFile(path) as archive:
@@ -413,7 +413,7 @@ def test_the_command_states_them_over_the_file_s_and_the_check_agrees(
         terms, page = (archive.read(f"documentation/{n}").decode()
                        for n in ("licenses/license.txt", "index.html"))  # fmt: skip
     assert_valid(xml, "schema", f"fmi{fmi}", f"fmi{fmi}ModelDescription.xsd")
-    stated = replace(SAID, version="0.9").stated
+    stated = replace(TERMS, version="0.9").stated
     assert {n: ET.fromstring(xml).attrib[n] for n in stated} == stated
     assert all(f"{name}: {text}" in terms for name, text in stated.items())
     assert "(c) 2026 A. Author &amp; sons" in page

@@ -38,8 +38,8 @@ KINDS = "tunable tunable dependent dependent dependent"
 def _unknown(fmi: int, name: str, *knowns: str, kinds: str) -> str:
     """Return how the description lists the dependencies of an output."""
     places = " ".join(str(PLACES[n]) for n in knowns)
-    item = "index" if fmi == 2 else "valueReference"
-    return f'{item}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
+    attribute = "index" if fmi == 2 else "valueReference"
+    return f'{attribute}="{PLACES[name]}" dependencies="{places}" dependenciesKind="{kinds}"'
 
 
 def _dependency(
@@ -56,7 +56,7 @@ def _of_state(fmi: int, unit: str) -> tuple[str, str]:
     return f'unit="V/s"{more}', f'unit="{unit}"{more}'
 
 
-#: By name: old and new text for a version of FMI, the rows, and a part of what one of them says.
+#: By name: old and new text for a version of FMI, the rows, and a part of the remark of one.
 Faults = dict[str, tuple[Callable[[int], tuple[str, str]], set[str], str]]
 DESCRIPTIONS: Faults = {
     "wrong token": (
@@ -133,13 +133,13 @@ XML = "modelDescription.xml"
 VERSIONS = (2, 3)
 #: Mistakes in the description that the quick tier tries.
 FEW = ("wrong token", "missing dependency", "wrong start value", "wrong unit of a derivative")
-#: Mistakes that each version has in a way of its own; the others come in one version, in turn.
+#: Mistakes that differ between the versions; the others come in one version, in turn.
 TWICE = ("wrong token", "missing dependency", "wrong unit of a derivative",
          "wrong number of event indicators")  # fmt: skip
 WRONG = [(fault, fmi) for k, fault in enumerate(DESCRIPTIONS) for fmi in VERSIONS
          if fault in (*TWICE, *FEW) or fmi == VERSIONS[k % 2]]  # fmt: skip
 harmless = pytest.mark.usefixtures("code_runs_here")
-#: Any change of description or sources is found by this row too.
+#: Any change of description or sources fails this row too.
 ALWAYS = "reproducible"
 
 
@@ -159,10 +159,10 @@ def _binary(fmi: int) -> str:
 def _reference_runs_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a sound FMU would give is the same for every fault: it is computed once."""
 
-    def remembered(*given: Any) -> FloatArray:
-        key = pickle.dumps(given)
+    def remembered(*arguments: Any) -> FloatArray:
+        key = pickle.dumps(arguments)
         if key not in _OUTPUTS:
-            _OUTPUTS[key] = expected_outputs(*given)
+            _OUTPUTS[key] = expected_outputs(*arguments)
         return _OUTPUTS[key]
 
     monkeypatch.setattr(agreement, "expected_outputs", remembered)
@@ -234,7 +234,7 @@ def test_wrong_sources(faults: str, tmp_path: Path) -> None:
     assert all(rows <= result for *_, rows in CORE[faults]), result
 
 
-#: Faults of the FMI 3.0 face that share a binary, as each has a row of its own.
+#: Faults of the FMI 3.0 face that share a binary, as each fails another row.
 FACE = {
     "fmi3_values.c": (
         (
@@ -263,7 +263,8 @@ MISSING = {
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     result = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
-    assert {"adjoint derivatives", "life cycle", "event indicators"} == set(result), result
+    rows = {"adjoint derivatives", "life cycle", "event indicators", "model exchange"}
+    assert rows == set(result), result
     assert "stays negative after an event" in result["event indicators"]
 
 
@@ -279,7 +280,7 @@ def test_a_function_under_another_name(tmp_path: Path) -> None:
 
 @slow
 def test_binaries_that_cannot_be_used(tmp_path: Path) -> None:
-    """Missing, cut off, or of something else: found, whatever loading them does."""
+    """Missing, cut off, or of something else: a failed row, whatever loading them does."""
     fmi = 2
     name, content = _binary(fmi), entries(STACK, fmi)[_binary(fmi)]
     left = {n: c for n, c in entries(STACK, fmi).items() if n != name}
@@ -356,8 +357,8 @@ def test_a_binary_in_the_folder_of_another_platform(fmi: int, tmp_path: Path) ->
     path, result = tmp_path / "b.fmu", entries(STACK, fmi)
     write_archive(path, {**result, "binaries/riscv64-linux/psa.so": result[_binary(fmi)]})
     with Archive(path) as moved:
-        (statement,) = binaries.misplaced_binaries(moved)
-    assert statement.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
+        (problem,) = binaries.misplaced_binaries(moved)
+    assert problem.startswith(f"riscv64-linux holds a binary for {host_platform().name}")
     with Archive(exported(STACK, fmi)) as whole:
         assert not list(binaries.misplaced_binaries(whole))
 

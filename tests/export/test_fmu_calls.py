@@ -1,4 +1,4 @@
-"""What an FMU says and does where calls fail, look wrong, or are sent with ill will.
+"""Messages and behaviour of an FMU where calls fail, look wrong, or are sent with ill will.
 
 Refused in words, never a crash or a hang; and what FMI 3.0 has beyond FMI 2.0: event mode,
 intermediate updates, early return.
@@ -56,7 +56,7 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
     with Fmu(exported(STACK, fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
         slave.set({"voltage": 50.0})
         slave.step(0.0, 1e-3)
-        snapshot, reached = slave.save(), ctypes.c_double()
+        snapshot, reached = slave.fmi.getFMUState(), ctypes.c_double()
         slave.set({"voltage": 1e300})
         if fmi == 2:
             assert slave.call("DoStep", 1e-3, 1e-3, 1) == DISCARD
@@ -65,18 +65,16 @@ def test_failed_step_names_state_and_time_and_can_be_undone(fmi: int) -> None:
             done = try_step(slave, 1e-3, 1e-3)
             assert done.status == DISCARD
             reached.value = done.time
-        statement = re.fullmatch(
-            r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1]
-        )
-        assert statement is not None
-        assert statement[2] in fmu.states()
+        match = re.fullmatch(r".* stopped at (\S+) s in state '(\w+)': \S.*", slave.messages[-1])
+        assert match is not None
+        assert match[2] in fmu.states()
         assert 1e-3 <= reached.value < 2e-3
-        assert float(statement[1]) == pytest.approx(reached.value, rel=1e-8)
+        assert float(match[1]) == pytest.approx(reached.value, rel=1e-8)
         with pytest.raises(FmuError) as refused:
             slave.step(reached.value, 1e-3)
         assert refused.value.status == ERROR
-        slave.restore(snapshot)
-        slave.drop(snapshot)
+        slave.fmi.setFMUState(snapshot)
+        slave.fmi.freeFMUState(snapshot)
         assert snapshot.value is None
         slave.set({"voltage": 60.0})
         slave.step(1e-3, 1e-3)
@@ -144,29 +142,29 @@ def slave() -> Iterator[Instance3]:
 
 @pytest.mark.parametrize("interface", [CO_SIMULATION, MODEL_EXCHANGE])
 @pytest.mark.parametrize(
-    ("changed", "value", "said"),
+    ("changed", "value", "match"),
     [("guid", "{0}", "token"), ("instanceName", "", "name is missing")],
 )
 def test_wrong_token_and_missing_name_give_no_instance(
-    interface: int, changed: str, value: str, said: str, monkeypatch: pytest.MonkeyPatch
+    interface: int, changed: str, value: str, match: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for fmi in (2, 3):
         with Fmu(exported(STACK, fmi)) as fmu:
             monkeypatch.setattr(fmu.loaded(interface), changed, value)
-            with pytest.raises(FmuError, match=said):
+            with pytest.raises(FmuError, match=match):
                 fmu.open(interface)
 
 
 def test_what_the_model_does_not_have_gives_no_instance() -> None:
     with pytest.raises(FmuError, match="no instance"):
         loaded(STACK).open(CO_SIMULATION, requiredIntermediateVariables=[10**6])
-    fmu, statement = loaded(STACK), list[bytes]()
+    fmu, logged = loaded(STACK), list[bytes]()
     other = FMU3ScheduledExecution(
         guid=fmu.token, modelIdentifier=fmu.identifier, unzipDirectory=str(fmu.directory)
     )
     with pytest.raises(Exception, match="Failed to instantiate"):
-        other.instantiate(logMessage=lambda *output: statement.append(output[-1]))
-    assert b"no scheduled execution" in statement[-1]
+        other.instantiate(logMessage=lambda *output: logged.append(output[-1]))
+    assert b"no scheduled execution" in logged[-1]
 
 
 def test_calls_out_of_order_are_refused_with_function_and_state(slave: Instance3) -> None:
@@ -219,10 +217,10 @@ def test_what_the_model_does_not_have_is_refused_with_the_reason(slave: Instance
 
 
 def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instance3) -> None:
-    observed: list[tuple[Update, float]] = []
+    updates: list[tuple[Update, float]] = []
 
     def watcher(instance: Instance3, update: Update) -> None:
-        observed.append((update, float(instance.get(["displacement"])[0])))
+        updates.append((update, float(instance.get(["displacement"])[0])))
         assert instance.get(["time"])[0] == update.time
         assert np.isfinite(instance.output_rates(["displacement"])).all()
         assert instance.call("Reset") == ERROR
@@ -232,14 +230,14 @@ def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instan
         for instance in (slave, watched):
             instance.set({"voltage": 50.0})
             assert instance.try_step(0.0, 1e-3).status == OK
-        times = [u.time for u, _ in observed]
+        times = [u.time for u, _ in updates]
         assert len(times) > 5
         assert np.all(np.diff(times) > 0.0)
         assert times[-1] == pytest.approx(1e-3)
-        assert all(u.get_allowed and u.step_finished for u, _ in observed)
-        assert [u.can_return_early for u, _ in observed] == [True] * (len(observed) - 1) + [False]
-        assert [u.set_requested for u, _ in observed] == [True] * (len(observed) - 1) + [False]
-        path = [d for _, d in observed]
+        assert all(u.get_allowed and u.step_finished for u, _ in updates)
+        assert [u.can_return_early for u, _ in updates] == [True] * (len(updates) - 1) + [False]
+        assert [u.set_requested for u, _ in updates] == [True] * (len(updates) - 1) + [False]
+        path = [d for _, d in updates]
         assert 0.0 < path[0] < path[-1]
         assert slave.get(OUTPUTS).tobytes() == watched.get(OUTPUTS).tobytes()
         assert slave.serialized() == watched.serialized()
@@ -330,7 +328,7 @@ def _play(slave: Instance3, first: int, last: int) -> bytes:
 
 
 def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Instance3) -> None:
-    """Two instances at different addresses write the same bytes; time stands where it should."""
+    """Two instances at different addresses write the same bytes; time is at its place."""
     _play(slave, 0, 7)
     data = slave.serialized()
     with Instance3(slave.fmu) as other:
@@ -344,12 +342,11 @@ def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Insta
     foreign, damaged = "another model, version or kind of machine", "damaged"
     flips = {0: foreign, 8: foreign, 16: foreign, 40: damaged, len(data) - 1: damaged}
     broken = [
-        (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], statement)
-        for k, statement in flips.items()
+        (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], reason) for k, reason in flips.items()
     ]
-    for wrong, statement in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
+    for wrong, reason in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
         assert slave.try_restore(wrong) == ERROR
-        assert statement in slave.messages[-1]
+        assert reason in slave.messages[-1]
     with Instance3(slave.fmu, MODEL_EXCHANGE) as exchange:
         assert exchange.try_restore(data) == ERROR
         assert "other interface" in exchange.messages[-1]
@@ -386,14 +383,14 @@ def _saved(instance: Instance, moved: str) -> bytes:
     """Return the state after a step, as bytes."""
     instance.set({moved: 5.0})
     instance.step(0.0, 1e-3)
-    snapshot = instance.save()
-    data = instance.serialize(snapshot)
-    instance.drop(snapshot)
+    snapshot = instance.fmi.getFMUState()
+    data: bytes = instance.fmi.serializeFMUState(snapshot)
+    instance.fmi.freeFMUState(snapshot)
     return data
 
 
 def _use(instance: Instance, moved: str) -> str:
-    """Set, step, differentiate and read an instance; return what it says if it refuses."""
+    """Set, step, differentiate and read an instance; return its message if it refuses."""
     state = instance.fmu.states()[0]
     try:
         now = float(instance.get(["time"])[0])
@@ -412,7 +409,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     path = exported(STACK) if model == "stack" else exported("loop", 3)
     moved = "voltage" if model == "stack" else "reference"
     refused: dict[tuple[int, bytes], int] = {}
-    statement, slowest = set(), 0.0
+    refusals, slowest = set(), 0.0
     with Fmu(path) as fmu, fmu.start(CO_SIMULATION) as instance:
         data = _saved(instance, moved)
         assert _forged(data, 0, data[STAMP : STAMP + 8]) == data
@@ -420,22 +417,22 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
             for content in WORDS:
                 begin = time.monotonic()
                 try:
-                    snapshot = instance.deserialize(_forged(data, word, content))
+                    snapshot = instance.fmi.deserializeFMUState(_forged(data, word, content))
                 except FmuError as refusal:
                     refused[word, content] = refusal.status
                     continue
-                instance.restore(snapshot)
-                instance.drop(snapshot)
-                statement.add(_use(instance, moved))
+                instance.fmi.setFMUState(snapshot)
+                instance.fmi.freeFMUState(snapshot)
+                refusals.add(_use(instance, moved))
                 slowest = max(slowest, time.monotonic() - begin)
-        snapshot = instance.deserialize(data)
-        instance.restore(snapshot)
-        instance.drop(snapshot)
+        snapshot = instance.fmi.deserializeFMUState(data)
+        instance.fmi.setFMUState(snapshot)
+        instance.fmi.freeFMUState(snapshot)
         instance.step(1e-3, 1e-3)
     states = range(3, 3 + len(fmu.states()))
     assert {(w, c) for w in states for c in (WORDS[0], WORDS[3])} <= set(refused)
     assert set(refused.values()) == {ERROR}
-    assert all(len(text) > 60 for text in statement - {""})
+    assert all(len(text) > 60 for text in refusals - {""})
     assert slowest < 5.0
 
 
@@ -445,12 +442,12 @@ def test_a_forged_parameter_is_named(either: Instance) -> None:
     data = _saved(either, "voltage")
     place = data.index(struct.pack("<d", kept), STAMP) - STAMP
     with pytest.raises(FmuError, match="altered: m_B cannot be"):
-        either.deserialize(_forged(data, place // 8, struct.pack("<d", -kept)))
+        either.fmi.deserializeFMUState(_forged(data, place // 8, struct.pack("<d", -kept)))
 
 
 def test_a_snapshot_that_frees_itself(either: Instance) -> None:
-    """Some importers pass the snapshot where its address is asked for; reference FMUs bear it."""
-    snapshot = either.save()
+    """Some importers pass the snapshot in the place of its address; reference FMUs bear it."""
+    snapshot = either.fmi.getFMUState()
     word = "FMUstate" if either.fmu.version == 2 else "FMUState"
     assert (
         getattr(either.fmu.library, f"fmi{either.fmu.version}Free{word}")(
@@ -460,9 +457,9 @@ def test_a_snapshot_that_frees_itself(either: Instance) -> None:
     )
     either.set({"voltage": 20.0})
     either.step(0.0, 1e-3)
-    either.restore(snapshot)  # nothing was freed, nothing written
+    either.fmi.setFMUState(snapshot)  # nothing was freed, nothing written
     assert either.get(["time", "voltage"]) == pytest.approx([0.0, 0.0])
-    either.drop(snapshot)
+    either.fmi.freeFMUState(snapshot)
     assert snapshot.value is None
 
 

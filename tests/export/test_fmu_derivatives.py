@@ -1,6 +1,6 @@
 """Directional and adjoint derivatives, at a point and through a co-simulation step.
 
-CasADi's own importer must see the right Jacobians, also those by parameters. It takes the sparsity
+CasADi's importer must see the right Jacobians, also those by parameters. It takes the sparsity
 from the dependencies in modelDescription.xml, and is silently wrong where one is missing.
 """
 
@@ -84,11 +84,11 @@ def _jacobian(
     return np.array([instance.directional(unknowns, knowns, list(c)) for c in columns]).T
 
 
-def _worst(found: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
+def _worst(result: FloatArray, truth: FloatArray, scales: FloatArray) -> float:
     """Return the largest difference, each row relative to its largest effect."""
     effects = np.abs(truth * scales)
     rows = np.maximum(effects.max(axis=1), 1e-300)
-    return float((np.abs((found - truth) * scales) / rows[:, None]).max())
+    return float((np.abs((result - truth) * scales) / rows[:, None]).max())
 
 
 def test_what_cannot_be_differentiated_is_refused() -> None:
@@ -96,7 +96,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
     with Instance3(loaded(name), MODEL_EXCHANGE) as instance:
         instance.start()
         for kind in ("Directional", "Adjoint"):
-            for unknown, known, statement in (
+            for unknown, known, reason in (
                 ("u", "voltage", "'u' is not calculated"),
                 ("voltage", "u", "'voltage' is not calculated"),
                 ("current", "charge", "'charge' is calculated and cannot be varied"),
@@ -104,7 +104,7 @@ def test_what_cannot_be_differentiated_is_refused() -> None:
                 vectors = (instance.references([unknown]), one, instance.references([known]), one)
                 status = instance.call(f"Get{kind}Derivative", *vectors, value, one, value, one)
                 assert status == ERROR
-                assert statement in instance.messages[-1]
+                assert reason in instance.messages[-1]
             status = instance.call(f"Get{kind}Derivative", *vectors, value, c_size_t(2), value, one)
             assert status == ERROR
             assert "scalars" in instance.messages[-1]

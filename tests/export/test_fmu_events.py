@@ -22,8 +22,7 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
     Instance,
 )
-from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.units import FloatArray
 from tests.export.fmi3_instances import Instance3, loaded
 from tests.export.fmu_models import entries, exported, model_named
@@ -222,7 +221,7 @@ def _signal(t: FloatArray) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def truth() -> dict[float, float]:
-    """Displacement at the ends of all steps that are tried, by a computation of its own."""
+    """Displacement at the ends of all steps that are tried, by an independent computation."""
     times = np.linspace(0.0, END, 2 * 3200 + 1)
     exact = reference.simulate(
         model_named(STACK).values, lambda t: float(_signal(np.array(t))), times
@@ -283,19 +282,19 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
     with Fmu(exported(STACK, fmi)) as fmu:
         with fmu.start(CO_SIMULATION, values={"input_line": 1.0}) as slave:
             _run(slave, 100, end=10)
-            snapshot = slave.save()
-            data = slave.serialize(snapshot)
+            snapshot = slave.fmi.getFMUState()
+            data = slave.fmi.serializeFMUState(snapshot)
             first = _run(slave, 100, first=10, end=20)
-            slave.restore(snapshot)
-            slave.drop(snapshot)
+            slave.fmi.setFMUState(snapshot)
+            slave.fmi.freeFMUState(snapshot)
             assert np.array_equal(_run(slave, 100, first=10, end=20), first)
             slave.require("Reset")
             slave.setup()
             assert slave.get(["input_line"])[0] == 0.0
         with fmu.open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            other.restore(copy)
-            other.drop(copy)
+            copy = other.fmi.deserializeFMUState(data)
+            other.fmi.setFMUState(copy)
+            other.fmi.freeFMUState(copy)
             assert np.array_equal(_run(other, 100, first=10, end=20), first)
             with pytest.raises(FmuError, match="'input_line' can be set only before the first"):
                 other.set({"input_line": 0.0})
@@ -308,7 +307,7 @@ def test_the_line_is_part_of_the_state(fmi: int) -> None:
 
 
 def test_a_jump_in_event_mode_starts_a_new_line() -> None:
-    """FMI 3.0: the step after event mode is held, whatever was given before."""
+    """FMI 3.0: the step after event mode is held, whatever was set before."""
     with Fmu(exported(STACK, 3)) as fmu:
         ends = []
         for line in (0.0, 1.0):

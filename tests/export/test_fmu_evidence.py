@@ -1,6 +1,6 @@
 """The evidence inside an FMU: page, meta data, run, parameter sets, and who lists them.
 
-What an FMU says outside of what the records behind its model have shown, and `psa check
+The output of an FMU outside of the range of its model's records, and `psa check
 --evidence`, which plays run and records again.
 """
 
@@ -22,8 +22,7 @@ from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
 from psa_casadi.export.fmu.reference_run import FOLDER
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
-from psa_casadi.export.importer.masters import communicate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
@@ -60,9 +59,9 @@ def test_experiments_name_files_that_are_there() -> None:
             p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
         }
         assert {*output.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
-        item = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
-        assert item.items() <= output.items()
-        assert item
+        units = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
+        assert units.items() <= output.items()
+        assert units
     one = table[f"{evidence.SETS}/sigma_02_minus.ssv"].decode()
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
@@ -125,8 +124,8 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
-    statement = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
-    assert "documentation/evidence.html (records: short), 8 parameter sets" in statement
+    words = done(*f"{line} --parameter-sets 1 --sets-to {sets}".split()).words
+    assert "documentation/evidence.html (records: short), 8 parameter sets" in words
     table = files_inside(path)
     assert len(list(sets.iterdir())) == 8
     for file in sets.iterdir():
@@ -144,7 +143,7 @@ _SAID = "From here on the results are extrapolated."
 def messages(
     fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
 ) -> tuple[list[str], np.ndarray]:
-    """Return what an FMU says of a triangle, and the output, in co-simulation."""
+    """Return a triangle and the output of an FMU on it, in co-simulation."""
     times = start + np.linspace(0.0, duration, steps + 1)
     volts = peak * (1.0 - np.abs(np.linspace(-1.0, 1.0, steps + 1)))
     inputs = Signals(("voltage",), times, volts[:, None])
@@ -155,15 +154,15 @@ def messages(
 
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
 def test_inside_nothing_is_said(fmi: int) -> None:
-    statement, outside = messages(fmi, 75.0, 0.5, start=1e3)
-    assert statement == []
+    logged, outside = messages(fmi, 75.0, 0.5, start=1e3)
+    assert logged == []
     assert np.all(outside == 0.0)
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
-    statement, outside = messages(fmi, 120.0, 0.6)
-    (line,) = statement
+    logged, outside = messages(fmi, 120.0, 0.6)
+    (line,) = logged
     assert line.startswith("voltage is 7")
     low, high = stated().seen.voltage.low, stated().seen.voltage.high
     assert f"from {low:.6g} to {high:.6g}." in line
@@ -175,20 +174,20 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
 @slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
 def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
-    statement, outside = messages(fmi, 75.0, 0.01)
-    assert len(statement) == 1
-    assert statement[0].startswith("The rate per second of voltage is 1")
+    logged, outside = messages(fmi, 75.0, 0.01)
+    assert len(logged) == 1
+    assert logged[0].startswith("The rate per second of voltage is 1")
     assert np.max(outside) > 1.0
-    statement, outside = messages(fmi, 75.0, 0.8)
-    assert len(statement) == 1
-    assert statement[0].startswith("The time since the start is 0.64")
+    logged, outside = messages(fmi, 75.0, 0.8)
+    assert len(logged) == 1
+    assert logged[0].startswith("The time since the start is 0.64")
     assert np.all(outside == 0.0)
 
 
 def test_a_temperature_beyond_the_records_counts_where_the_model_has_one() -> None:
     model = evident_model()
-    observed = replace(stated().seen, temperature=Interval(290.0, 300.0))
-    output = replace(stated(), seen=observed)
+    ranges = replace(stated().seen, temperature=Interval(290.0, 300.0))
+    output = replace(stated(), seen=ranges)
     assert "seen_temperature_low" not in with_validity(replace(model, evidence=output)).values
     warm = replace(model.with_effect(psa.EFFECTS["temperature"]), evidence=output)
     watched = with_validity(warm)
@@ -308,6 +307,6 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
 
 @pytest.mark.slow
 def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
-    """Where none is asked for, it passes: tests/export/test_fmu.py."""
+    """Without `evidence` it passes: tests/export/test_fmu.py."""
     report = psa.check_fmu(exported("P-885.51"), evidence=True)
     assert [r.name for r in report.failures] == ["evidence"]

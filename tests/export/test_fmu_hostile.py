@@ -1,6 +1,6 @@
 """FMUs with ill will: code that exits, crashes, hangs or fills memory, archives that lead outside.
 
-Every end is told apart; of a hostile archive nothing is unpacked.
+Every end has a message; of a hostile archive nothing is unpacked.
 """
 
 import os
@@ -63,7 +63,7 @@ def library() -> bytes:
 
 
 def hostile_fmu(path: Path, fmi: int, content: bytes | None = None) -> Path:
-    """Write the FMU, with another content of its library if one is given."""
+    """Write the FMU, with another content of its library if there is one."""
     folder = fmpy.platform_tuple if fmi == 3 else fmpy.platform
     with zipfile.ZipFile(path, "w") as archive:
         archive.write(_SOURCES / f"fmi{fmi}.xml", "modelDescription.xml")
@@ -158,7 +158,7 @@ def test_a_bad_end_after_all_checks(
 def test_a_hang_ends_at_the_time_limit(
     moment: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The limit is looked at where the hang has begun, however slow the machine is."""
+    """The limit is checked once the hang has started, however slow the machine is."""
     place, limits = tmp_path / "place", list[float]()
 
     def heard_at_last(child: "subprocess.Popen[bytes]", *, limit: float) -> object:
@@ -277,14 +277,14 @@ def test_such_an_archive_is_neither_unpacked_nor_run(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(limits, "MOST_ENTRIES", 30)
-    change, statement = (NAMES | SIZES)[what]
+    change, remark = (NAMES | SIZES)[what]
     path = _archive(tmp_path / "h.fmu")
     assert not any(archive_problems(path).values())
     with zipfile.ZipFile(path, "a") as archive:
         change(archive)
     report = check_fmu(path)
     row = "archive names" if what in NAMES else "archive size"
-    assert [(r.name, statement in r.remark) for r in report.failures] == [(row, True)]
+    assert [(r.name, remark in r.remark) for r in report.failures] == [(row, True)]
     assert all(r.name.startswith("archive") for r in report.rows)
     assert all(r.remark.isprintable() for r in report.rows)
     for reader in (Archive, SspArchive):
@@ -295,8 +295,8 @@ def test_such_an_archive_is_neither_unpacked_nor_run(
 
 def test_sizes_of_all_entries_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(limits, "MOST_BYTES", 100)
-    (statement,) = archive_problems(_archive(tmp_path / "h.fmu"))["archive size"]
-    assert "more than 100" in statement
+    (problem,) = archive_problems(_archive(tmp_path / "h.fmu"))["archive size"]
+    assert "more than 100" in problem
 
 
 def _damaged(path: Path, how: str) -> None:
@@ -312,18 +312,18 @@ def _damaged(path: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "row", "said"),
+    ("how", "row", "match"),
     [
         ("cut off", "archive intact", "the archive is damaged"),
         ("checksum", "archive intact", "'modelDescription.xml' is damaged"),
         ("encrypted", "archive names", "'modelDescription.xml' is encrypted"),
     ],
 )
-def test_damage(how: str, row: str, said: str, tmp_path: Path) -> None:
+def test_damage(how: str, row: str, match: str, tmp_path: Path) -> None:
     path = _archive(tmp_path / "h.fmu")
     _damaged(path, how)
     report = check_fmu(path)
-    assert [(r.name, said in r.remark) for r in report.failures] == [(row, True)], report.rows
+    assert [(r.name, match in r.remark) for r in report.failures] == [(row, True)], report.rows
     assert len(report.rows) == 3
 
 

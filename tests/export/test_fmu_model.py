@@ -98,13 +98,13 @@ def test_rates_outputs_and_their_derivatives_are_those_of_the_fmu() -> None:
     assert y == pytest.approx([0.5 * np.sin(0.3), -0.7], rel=1e-14)
     by = ca.vertcat(s.x, s.u, s.p)
     slopes = ca.Function("slopes", s.arguments, [s.jacobian(s.xdot, by), s.jacobian(s.y, by)])
-    rates, displayed = (np.array(v) for v in slopes(0.0, AT, 1.3, model.parameter_vector()))
+    rates, outputs = (np.array(v) for v in slopes(0.0, AT, 1.3, model.parameter_vector()))
     exact = [-9.81 * np.cos(0.3) / 0.5, -0.05 / 0.25, 4.0, np.nan, 0.7 / 0.25]
     held = 1.3 + 0.05 * 0.7
     exact[3] = -2.0 * held / 0.5**3 + 9.81 * np.sin(0.3) / 0.5**2
     assert rates[1] == pytest.approx(exact, rel=1e-7)
     assert rates[0] == pytest.approx([0, 1, 0, 0, 0])
-    assert displayed[0] == pytest.approx(
+    assert outputs[0] == pytest.approx(
         [0.5 * np.cos(0.3), 0, 0, np.sin(0.3), 0], rel=1e-7, abs=1e-9
     )
 
@@ -146,10 +146,10 @@ def test_a_torque_that_goes_no_further_is_named() -> None:
 def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
     x, u, k = (ca.SX.sym(n) for n in ("x", "voltage", "k"))
     k_ = psa.Parameter("k", 3.0, "1/s", (0.1, 30.0), "rate", log=True)
-    item = psa.ode_model(
+    own = psa.ode_model(
         {"x": x, "u": u, "p": k, "ode": k * (u - x**3), "y": x + u}, name="cubic", parameters=[k_]
     )
-    path = psa.export_fmu(item, tmp_path / "cubic.fmu", fmi=3)
+    path = psa.export_fmu(own, tmp_path / "cubic.fmu", fmi=3)
     there = psa.fmu_model(path, free=["k"])
     u_: FloatArray = np.sin(np.arange(300) * 0.1)[:, None]
 
@@ -157,9 +157,9 @@ def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
         steps = psa.run(model, 4 * T[:300], u_, np.zeros(1), unknowns=["k"], outputs=["y"])
         return np.hstack([steps.y, steps.sensitivity[:, 0]])
 
-    assert run(there) == pytest.approx(run(item), rel=1e-6, abs=1e-7)
+    assert run(there) == pytest.approx(run(own), rel=1e-6, abs=1e-7)
     simulated = psa.simulate(there, 4 * T[:300], u_[:, 0], rtol=1e-7)
-    assert simulated.outputs["y"] == pytest.approx(run(item)[:, 0], rel=1e-6, abs=1e-6)
+    assert simulated.outputs["y"] == pytest.approx(run(own)[:, 0], rel=1e-6, abs=1e-6)
     with pytest.raises(psa.InputError, match="can only begin at its start values"):
         start_state(there, [0.0])
     values = [{"k": v} for v in np.linspace(1.0, 9.0, 40)]

@@ -50,9 +50,9 @@ HALF = STEPS // 2
 LIMIT = 1e-12
 
 
-def difference(found: FloatArray, expected: FloatArray) -> float:
+def difference(result: FloatArray, expected: FloatArray) -> float:
     """Return the largest difference, each column relative to its largest value."""
-    return float(np.max(np.abs(found - expected) / np.max(np.abs(expected), axis=0)))
+    return float(np.max(np.abs(result - expected) / np.max(np.abs(expected), axis=0)))
 
 
 @pytest.mark.parametrize("fmi", VERSIONS)
@@ -135,7 +135,7 @@ export_fmu(model_named(STACK), sys.argv[1], fmi=int(sys.argv[2]), platforms=sys.
 
 
 def export_apart(folder: Path, fmi: int, *platforms: str, **changes: str) -> bytes:
-    """Export in a new process with its own working and temporary folders; return the archive."""
+    """Export in a new process with separate working and temporary folders; return the archive."""
     for name in ("work", "temporary"):
         (folder / name).mkdir(parents=True)
     environment = {
@@ -208,7 +208,7 @@ def read(fmi: int, name: str) -> object:
 @pytest.mark.parametrize("fmi", VERSIONS)
 @pytest.mark.parametrize("name", LINUX)
 def test_linux(name: str, fmi: int) -> None:
-    """FMI functions only, from libc and libm of 2.17 or older, found by no path of this machine.
+    """FMI functions only, from libc and libm of 2.17 or older, by no path of this machine.
 
     RISC-V has them from 2.27 on.
     """
@@ -249,8 +249,8 @@ def test_windows(name: str, fmi: int) -> None:
 def test_macos(name: str, fmi: int) -> None:
     """All FMI functions; a relative install name, the system's library alone, macOS 11 or later.
 
-    The linker exports two symbols of its own, which name the header of the file. What has no effect
-    in a library is the load command for a dynamic linker; nothing else is beside the usual ones.
+    The linker exports two symbols, which name the header of the file. What has no effect
+    in a library is the load command for a dynamic linker; all others are the usual ones.
     """
     library = read(fmi, name)
     assert isinstance(library, lief.MachO.Binary)
@@ -268,7 +268,7 @@ def test_macos(name: str, fmi: int) -> None:
     assert {c.command.name for c in library.commands} <= usual
     assert library.build_version is not None
     assert list(library.build_version.minos) == [11, 0, 0]
-    # an unsigned library cannot be loaded on Apple's own processors
+    # an unsigned library cannot be loaded on Apple's processors
     assert library.has_code_signature or name == "x86_64-darwin"
     cpu = {"x86_64-darwin": "X86_64", "aarch64-darwin": "ARM64"}[name]
     assert library.header.cpu_type.name == cpu
@@ -290,7 +290,7 @@ COUNTED = (
 
 
 def complaints(command: Sequence[str | Path]) -> str:
-    """Run a program; return what it and its guard said, empty if all sequences ended well."""
+    """Run a program; return its output and its guard's, empty if all sequences ended well."""
     options = {
         "ASAN_OPTIONS": "detect_leaks=1:detect_stack_use_after_return=1",
         "UBSAN_OPTIONS": "print_stacktrace=1",

@@ -19,9 +19,9 @@ from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.importer.play import Run, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
-from psa_casadi.export.importer.signals import Signals
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError
@@ -52,9 +52,9 @@ def _own() -> psa.Model:
     )  # fmt: skip
 
 
-def _record(area: float, outlet: float, shown: FloatArray | None = None) -> dict[str, FloatArray]:
+def _record(area: float, outlet: float, y: FloatArray | None = None) -> dict[str, FloatArray]:
     """Return what is measured of a tank; nothing of its equations is the FMU's."""
-    y = level(area, outlet) if shown is None else shown
+    y = level(area, outlet) if y is None else y
     noise = 1e-3 * np.random.default_rng(5).standard_normal(len(TIMES))
     return {"time": TIMES, "inflow": INFLOW, "level": y + noise}
 
@@ -65,13 +65,13 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
         "k": 1.7, "lag_of_u_time": 0.3, "bend_of_u_size": 0.2, "lag_of_y_time": 0.4,
         "gain_of_y_size": 0.1, "delay_of_y_time": 0.2,
     }  # fmt: skip
-    item = _own()
+    own = _own()
     whole = psa.fmu_model(
-        psa.export_fmu(item, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
+        psa.export_fmu(own, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
     )
     table = {e.name: e for e in effects_of(whole, ALL)}
     items = []
-    for base in (item, whole):
+    for base in (own, whole):
         model = extended(base, [table[n] for n in names]).with_values(values)
         free = ["k", *(n for n in values if n != "k")]
         start = start_for(model, T, U, {})
@@ -94,7 +94,7 @@ def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
         validate=False,
     )["level"]  # fmt: skip
     truth = level(0.5, 0.01)
-    errors = [np.max(np.abs(displayed - truth)) for displayed in (y, peer)]
+    errors = [np.max(np.abs(y - truth)) for y in (y, peer)]
     assert errors[0] < 1e-4 * np.ptp(truth)
     assert errors[1] > 30 * errors[0]  # it holds the input at its value before the step
 
@@ -113,8 +113,8 @@ def test_a_step_is_divided_where_the_fmu_is_fast(tmp_path: Path) -> None:
             new.writestr(entry, re.sub(rb' stepSize="[^"]*"', b"", old.read(entry)))
     exact = psa.run(fast, T[::4], U[::4], np.zeros(1), rtol=1e-9).y
     there = psa.fmu_model(path, free=["k"], interface="co-simulation")
-    displayed = psa.run(there, T[::4], U[::4], np.zeros(0)).y
-    assert np.std(displayed - exact) < 1e-3 * np.std(exact)
+    played = psa.run(there, T[::4], U[::4], np.zeros(0)).y
+    assert np.std(played - exact) < 1e-3 * np.std(exact)
     table = {"k": 40.0}
     run = Run(str(path), "", 1, ("u",), ("y",), table, T[::4], U[::4], "linear")
     with Fmu(path) as fmu:
@@ -163,7 +163,7 @@ def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> Non
     k_ = psa.Parameter("k", 1.0, "1/s", (0.1, 9.0), "rate")
     model = psa.ode_model(ode, name="switched", parameters=[k_], outputs=["y"])
     path = psa.export_fmu(model, tmp_path / "switched.fmu", fmi=3)
-    # a step of co-simulation has one value of the input, and so begins or ends at the event
+    # a step of co-simulation has one value of the input, and so starts or ends at the event
     ways: list[tuple[FmuInterface, float]] = [("model exchange", 1e-4), ("co-simulation", 0.02)]
     for interface, most in ways:
         there = psa.fmu_model(path, free=["k"], interface=interface)
@@ -229,11 +229,11 @@ def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
     of = ["--fmu", supplied("tank"), "--value", "valve=1"]
     out = tmp_path / "out.csv"
     typed("simulate", *of, "--value", "area=0.7", "--input", record, "-o", out)
-    displayed = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
-    assert displayed == pytest.approx(level(0.7, 0.01), abs=1e-3)
+    simulated = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
+    assert simulated == pytest.approx(level(0.7, 0.01), abs=1e-3)
     for name in ("fit.fmu", "fit.ssv", "fit.json"):
-        statement = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
-        assert ("an importer must set the start values" in statement) == (name == "fit.fmu")
+        printed = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
+        assert ("an importer must set the start values" in printed) == (name == "fit.fmu")
     with zipfile.ZipFile(tmp_path / "fit.fmu") as archive:
         root = ET.fromstring(archive.read("modelDescription.xml"))
     starts = {v.get("name"): v[0].get("start") for v in root.iterfind("ModelVariables/*")}
@@ -263,13 +263,11 @@ def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
     flow = np.interp(fine, TIMES, INFLOW)[:, None]
     with SspArchive(path) as archive:
         assert archive.parameters["original"] == {"area": 0.7, "valve": 1.0}
-        displayed = couple(
+        coupled = couple(
             archive, fine, Signals(("inflow",), fine, flow), ["level"], rates=False
         )[:, 0]  # fmt: skip
     truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
-    assert np.interp(TIMES, fine, displayed) == pytest.approx(
-        truth, abs=0.01 * float(np.ptp(truth))
-    )
+    assert np.interp(TIMES, fine, coupled) == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
     with zipfile.ZipFile(path) as inside:
         assert inside.read("resources/original.fmu") == supplied("tank").read_bytes()
         root = ET.fromstring(inside.read("resources/original.ssv"))
@@ -280,8 +278,8 @@ def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
     played = fmpy.simulate_fmu(
         str(one), stop_time=100.0, output_interval=0.05, input=inputs, output=["level"]
     )
-    displayed = np.interp(TIMES, played["time"], played["level"])
-    assert displayed == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
+    alone = np.interp(TIMES, played["time"], played["level"])
+    assert alone == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
     ball = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0)})
     with pytest.raises(psa.InputError, match=r"is of FMI 3\.0, which no FMU holds here"):
         psa.export_extended(ball, tmp_path / "ball.fmu")

@@ -1,4 +1,4 @@
-"""`psa check` of FMUs of other tools: each fault of a small one is found, and nothing else."""
+"""`psa check` of FMUs of other tools: each fault of a small one fails its row alone."""
 
 import json
 import tempfile
@@ -20,7 +20,7 @@ from tests.tiers import slow_but
 
 _SOURCES = Path(__file__).with_name("faulty")
 _FOLDER = tempfile.TemporaryDirectory()
-#: The row that finds each fault, and what it says.
+#: The row that each fault fails, and its remark.
 FAULTS = {
     1: ("start values", "'k' starts at 2.5, its description says 2"),
     2: ("values are taken", "'k' was set to 2.02 and is 2"),
@@ -48,10 +48,10 @@ def faulty(number: int, lines: str = "false") -> Path:
     (folder / "filter.c").write_bytes((_SOURCES / "filter.c").read_bytes())
     command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{files('fmpy') / 'c-code'}"]
     run_compiler([*command, f"-DFAULT={number}", "filter.c", "-o", str(library)], folder)
-    statement = (_SOURCES / "modelDescription.xml").read_text("utf-8")
+    template = (_SOURCES / "modelDescription.xml").read_text("utf-8")
     initial = "" if number == 10 else '<Unknown index="4"/>'
     with zipfile.ZipFile(folder / "filter.fmu", "w") as archive:
-        text = statement.format(known="1" if number == 8 else "1 3", initial=initial, lines=lines)
+        text = template.format(known="1" if number == 8 else "1 3", initial=initial, lines=lines)
         archive.writestr("modelDescription.xml", text)
         archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
     return folder / "filter.fmu"
@@ -71,9 +71,9 @@ def test_an_fmu_without_a_fault_passes() -> None:
 @pytest.mark.parametrize("number", slow_but([1, 8], FAULTS))
 def test_each_fault_is_found_by_its_row(number: int) -> None:
     rows = {r.name: r for r in psa.check_fmu(faulty(number)).failures}
-    name, statement = FAULTS[number]
-    assert statement in rows[name].remark
-    if number != 11:  # without an instance nothing else can be seen
+    name, remark = FAULTS[number]
+    assert remark in rows[name].remark
+    if number != 11:  # without an instance no other row can pass
         assert set(rows) <= {name} | _ALSO.get(number, set())
 
 

@@ -43,9 +43,9 @@ def _without_version(text: str) -> list[str]:
 
 def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
     path = tmp_path / "PiezoStack.mo"
-    statement = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
-    assert "left out: sensor" in statement
-    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in statement
+    words = done("export", "modelica", "--stack", "P-885.51", "-o", path).words
+    assert "left out: sensor" in words
+    assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in words
     expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
     texts = _without_version(path.read_text(encoding="utf-8"))
     diff = "".join(difflib.unified_diff(expected, texts, "accepted", "found", n=1))
@@ -212,7 +212,7 @@ def test_the_reaction_is_there_whatever_the_gain_of_the_model() -> None:
 
 
 def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
-    """The stage between a spring to the ground and a position that is given."""
+    """The stage between a spring to the ground and a prescribed position."""
     text = modelica_text(psa.compose([psa.COMPONENTS["flexure"]], name="flexure"), name="Stage")
     bench = Path(__file__).with_name("modelica_bench.mo").read_text("utf-8")
     got = simulated(STUB + text + bench, "Bench", 0.05, rtol=1e-10)
@@ -224,7 +224,7 @@ def test_a_stage_has_a_flange_to_be_pushed_at() -> None:
 
 
 def test_scaled_forces_give_the_free_stroke_of_the_cascade() -> None:
-    """What the documentation of `Acausal` says about its stroke."""
+    """As the documentation of `Acausal` states its stroke."""
     model = psa.stack_model("P-885.51")
     p = model.values
     scale = (p["k_P"] + p["k_B"]) / p["k_B"]

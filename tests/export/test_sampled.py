@@ -19,8 +19,7 @@ from psa_casadi.export.importer.fmu import (
     Fmu,
     FmuError,
 )
-from psa_casadi.export.importer.masters import co_simulate, integrate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.simulation.stepper import run
@@ -110,7 +109,7 @@ def test_balances_in_next_are_those_before_the_instant() -> None:
 
 
 def _second(**changes: object) -> Component:
-    """Return a sampled counter with a period of its own, with changes."""
+    """Return a sampled counter with another period, with changes."""
     second = replace(
         ALONE,
         name="second",
@@ -128,7 +127,7 @@ _ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.
 
 
 @pytest.mark.parametrize(
-    ("components", "said"),
+    ("components", "match"),
     [
         ((PLANT, replace(CONTROLLER, sampled=())), "declares only one of"),
         ((PLANT, replace(CONTROLLER, sample_period="T_none")),
@@ -143,8 +142,8 @@ _ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.
         ((PLANT, ALONE), "Two components declare 'position'"),
     ],
 )  # fmt: skip
-def test_mistakes_of_a_declaration_are_named(components: tuple[Component, ...], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_mistakes_of_a_declaration_are_named(components: tuple[Component, ...], match: str) -> None:
+    with pytest.raises(InputError, match=match):
         compose(components)
 
 
@@ -224,9 +223,9 @@ def reference(slope: float) -> Signals:
     return Signals(("disturbance", "reference"), np.array([0.0, 1.0]), values)
 
 
-def error(found: FloatArray, times: FloatArray, slope: float) -> float:
+def error(outputs: FloatArray, times: FloatArray, slope: float) -> float:
     truth = expected(times, 1.0, slope)
-    return float(np.abs(found - np.column_stack([truth.position, truth.voltage])).max())
+    return float(np.abs(outputs - np.column_stack([truth.position, truth.voltage])).max())
 
 
 @VERSIONS

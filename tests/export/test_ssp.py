@@ -12,7 +12,7 @@ from lxml import etree  # type: ignore[import-untyped]
 
 from psa_casadi.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp import (
     OUTSIDE,
     Port,

@@ -17,8 +17,7 @@ from psa_casadi.export.common.variable_table import START_VOLTAGE
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
-from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state
@@ -149,7 +148,7 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
         model, np.append(before, corners[-1] + t[1:]), np.append(played, voltage[1:])
     ).displacement[2400:]
     memory = psa.memory_after(model, turns[1:-1], at=turns[-1], sweep=sweep, rest=rest)
-    # the record begins in motion: the fast states start there, as `start_state` has it
+    # the record starts in motion: the fast states start there, as `start_state` has it
     result = psa.simulate(model, t, voltage, memory=memory).displacement
     assert np.abs(result - whole)[50:].max() < 1e-4 * np.ptp(whole)
 
@@ -179,20 +178,20 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
-    for history, statement in (("120", "--start-voltage"), ("high", "--history is 'high'")):
-        assert statement in refused(*command, "--history", history)
+    for history, reason in (("120", "--start-voltage"), ("high", "--history is 'high'")):
+        assert reason in refused(*command, "--history", history)
 
 
 @pytest.mark.parametrize(
-    ("turns", "options", "said"),
+    ("turns", "options", "match"),
     [
         ([np.nan], {}, "not finite"),
         ([10.0], {"sweep": 0.0}, "above 0"),
         ([10.0], {"rest": -1.0}, "0 or more"),
     ],
 )
-def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], said: str) -> None:
-    with pytest.raises(psa.InputError, match=said):
+def test_bad_numbers_are_named(turns: list[float], options: dict[str, float], match: str) -> None:
+    with pytest.raises(psa.InputError, match=match):
         psa.memory_after(STACK, turns, at=5.0, **options)
 
 
@@ -208,44 +207,44 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     psa.write_record(made / "v.csv", {"time [s]": TIME, "voltage [V]": VOLTAGE})
     psa.save_model(STACK, made / "plain.json")
     psa.save_model(psa.settled_at(STACK, 60.0, [120.0, 0.0]), made / "held.json")
-    statement = done(
+    words = done(
         "export", "fmu", "--model", made / "plain.json", "-o", made / "m.fmu", *OPTIONS
     ).words
-    assert "start: the start values of the model at 60 V" in statement
+    assert "start: the start values of the model at 60 V" in words
     return made
 
 
 def _simulated(folder: Path, model: str, *options: str) -> tuple[FloatArray, str]:
     out = folder / "out.csv"
     files = ("--model", folder / model, "--input", folder / "v.csv", "-o", out)
-    statement = done("simulate", *files, *options).out
+    printed = done("simulate", *files, *options).out
     result = psa.read_record(out).displacement
     assert result is not None
-    return result, next(line for line in statement.splitlines() if line.startswith("start: "))
+    return result, next(line for line in printed.splitlines() if line.startswith("start: "))
 
 
 def test_the_same_start_gives_the_same_trajectory_in_the_command_and_in_the_fmu(
     folder: Path,
 ) -> None:
-    """Also where the start is in the model file; without it the two differ, and it is said."""
+    """Also where the start is in the model file; without it the two differ, with a message."""
     inputs = Signals(("voltage",), TIME, VOLTAGE[:, None])
     with Fmu(folder / "m.fmu") as fmu:
         truth = co_simulate(fmu, TIME, inputs, ["displacement"], tolerance=1e-9)[:, 0]
     span = float(np.ptp(truth))
     for model, options in (("plain.json", OPTIONS), ("held.json", [])):
-        result, statement = _simulated(folder, model, *options)
+        result, line = _simulated(folder, model, *options)
         assert np.abs(result - truth).max() < 3e-6 * span, model
-        assert "at 60 V, as an exported FMU has them" in statement
-        assert "step" not in statement
-    relaxed, statement = _simulated(folder, "plain.json")
+        assert "at 60 V, as an exported FMU has them" in line
+        assert "step" not in line
+    relaxed, line = _simulated(folder, "plain.json")
     assert np.abs(relaxed - truth).max() > 0.02 * span
-    assert "settled at 60 V" in statement
-    assert "--start-voltage 60" in statement
-    _, statement = _simulated(folder, "held.json", "--start-voltage", "0")
-    assert "at 0 V" in statement
-    assert "step from there to 60 V" in statement
-    _, statement = _simulated(folder, "held.json", "--history", "120,0")
-    assert "where the history 120,0 V leaves them" in statement
+    assert "settled at 60 V" in line
+    assert "--start-voltage 60" in line
+    _, line = _simulated(folder, "held.json", "--start-voltage", "0")
+    assert "at 0 V" in line
+    assert "step from there to 60 V" in line
+    _, line = _simulated(folder, "held.json", "--history", "120,0")
+    assert "where the history 120,0 V leaves them" in line
 
 
 def test_a_history_is_played_from_relaxed_whatever_start_the_model_has() -> None:
@@ -302,7 +301,7 @@ def apart(fmu: Fmu, instance: Instance, expected: dict[str, float]) -> float:
     return float(np.max(np.abs(instance.get(list(expected)) - list(expected.values())) / size))
 
 
-def begun(fmu: Fmu, voltage: float) -> Instance:
+def started_at(fmu: Fmu, voltage: float) -> Instance:
     """Return an instance in initialization mode with this `start_voltage`."""
     instance = fmu.open(MODEL_EXCHANGE)
     if fmu.version == 2:
@@ -317,17 +316,17 @@ def begun(fmu: Fmu, voltage: float) -> Instance:
 @BOTH
 @pytest.mark.parametrize("voltage", [60.0, 0.0])
 def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage: float) -> None:
-    """Until the initialization ends, as the description says that outputs depend on it."""
+    """Until the initialization ends, as outputs depend on it in the description."""
     with Fmu(exported(NAME, fmi)) as fmu:
         entries = {e.variable.name: e for e in fmu.description.initialUnknowns}
         names = [n for n, e in entries.items() if START_VOLTAGE in [d.name for d in e.dependencies]]
         assert {"displacement", "der(u)"} <= set(names)
         ends = []
         for side in (0.05, -0.05):
-            with begun(fmu, voltage + side) as instance:
+            with started_at(fmu, voltage + side) as instance:
                 ends.append(instance.get(names))
         change = (ends[0] - ends[1]) / 0.1
-        with begun(fmu, voltage) as instance:
+        with started_at(fmu, voltage) as instance:
             values = instance.directional(names, [START_VOLTAGE], [1.0])
             moved = np.array([n in ("charge", "displacement", "blocked_force") for n in names])
             assert np.allclose(values[moved], change[moved], rtol=1e-4, atol=0.0)
@@ -370,15 +369,15 @@ def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> 
             slave.set({START_VOLTAGE: voltage})
             assert apart(fmu, slave, settled(model, voltage) | {"voltage": voltage}) < 1e-8
             assert slave.get(["displacement"])[0] == slave.get(["x"])[0]
-        snapshot = slave.save()
-        copy = slave.serialize(snapshot)
+        snapshot = slave.fmi.getFMUState()
+        copy = slave.fmi.serializeFMUState(snapshot)
         slave.set({START_VOLTAGE: 0.0})
         assert apart(fmu, slave, dict.fromkeys((*model.state_names, "voltage"), 0.0)) == 0.0
-        back = slave.deserialize(copy)
-        slave.restore(back)
+        back = slave.fmi.deserializeFMUState(copy)
+        slave.fmi.setFMUState(back)
         assert apart(fmu, slave, settled(model, 25.0)) < 1e-8
         for data in (snapshot, back):
-            slave.drop(data)
+            slave.fmi.freeFMUState(data)
         slave.require("ExitInitializationMode")
         with pytest.raises(FmuError, match="'start_voltage' can be set only before"):
             slave.set({START_VOLTAGE: 10.0})
@@ -388,7 +387,7 @@ def test_within_the_initialization_it_counts_at_once_and_can_be_taken_back() -> 
 
 
 def test_the_exported_start_is_that_of_the_exported_value() -> None:
-    """With its history, to the last bit; another value begins without that history."""
+    """With its history, to the last bit; another value starts without that history."""
     held = psa.settled_at(model_named(NAME), 60.0, [120.0, 0.0]).plant()
     starts = {q.name: q.start for q in held.structure.states} | {"voltage": 60.0}
     with temporary_folder() as folder:

@@ -35,13 +35,13 @@ def loops(samples: int = 400, period: float = 0.02) -> tuple[FloatArray, FloatAr
     return t, v
 
 
-def off(found: FloatArray, wanted: FloatArray) -> float:
+def off(result: FloatArray, wanted: FloatArray) -> float:
     """Return the largest difference over the range."""
-    return float(np.max(np.abs(found - wanted)) / np.ptp(wanted))
+    return float(np.max(np.abs(result - wanted)) / np.ptp(wanted))
 
 
 def inputs(model: psa.Model, v: FloatArray) -> FloatArray:
-    """Return the samples of all inputs, those beside the voltage constant."""
+    """Return the samples of all inputs, all but the voltage constant."""
     return input_samples(model, len(v), {"voltage": v})
 
 

@@ -1,1 +1,1 @@
-"""`psa check`: what an FMU says and does, row by row."""
+"""`psa check`: description and behaviour of an FMU, row by row."""

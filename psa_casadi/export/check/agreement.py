@@ -13,11 +13,11 @@ import numpy as np
 from psa_casadi.components import BASE, SIMPLIFIED
 from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import BREAKDOWNS
-from psa_casadi.export.common.markup import time_scale
 from psa_casadi.export.common.variable_table import starts_at_voltage
-from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, played_inputs, shown_output
+from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, main_output, played_inputs
+from psa_casadi.export.fmu import reference_run
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.compose import Model
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.simulate import settled_at
@@ -31,8 +31,8 @@ from psa_casadi.variables import nominal_value
 class Run:
     """One run: where its inputs and points are, what must come of it, how far off it may be.
 
-    `expected` (n, ny) at `times` (n,); `integrated` says that model exchange is used; a `tolerance`
-    of None is the importer's. `scale` (ny,) and `by` are those of the truth unless given.
+    `expected` (n, ny) at `times` (n,); `integrated` is true for model exchange; a `tolerance`
+    of None is the importer's. `scale` (ny,) and `by` are those of the truth by default.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Truth:
 
     `f` and `switches` take time and the vectors of states, inputs, parameters and sampled states.
     `starts` are the values of states, inputs and outputs before anything is set, `settled_starts`
-    those of states and voltage, each with its usual size, where the FMU is told to begin settled at
+    those of states and voltage, each with its usual size, where the FMU starts settled at
     `start_voltage` [V]; None if they are not known. `compared` names what the runs compare, `scale`
     (ny,) its size, `by` who computed it.
     """
@@ -84,16 +84,15 @@ _TOLERANCE = 1e-10
 _SLOW_STEPS = (1e-2, 1e-3, 1e-4)
 _MOST_STEPS = 6000
 _FAST_STEP, _FAST_COUNT = 1e-6, 3000
-_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 
 
 def signals_of(model: Model, segment: float) -> Signals:
     """Return a test signal: six straight segments [s each] from 0 up to every input's nominal."""
-    times = np.array([segment * k for k in range(len(_SHAPE))])
-    columns = []
-    for i, declared in enumerate(model.structure.inputs):
-        shape = np.roll(_SHAPE[1:], 2 * i)
-        columns.append(nominal_value(declared.nominal, model.values) * np.array([0.0, *shape]))
+    times = np.array([segment * k for k in range(len(reference_run.SHAPE))])
+    columns = [
+        nominal_value(declared.nominal, model.values) * reference_run.shifted(i)
+        for i, declared in enumerate(model.structure.inputs)
+    ]
     return Signals(model.input_names, times, np.array(columns).T.reshape(len(times), -1))
 
 
@@ -199,8 +198,7 @@ def _with_runs(truth: Truth, model: Model, *, held: bool) -> Truth:
     of FMI 3.0, which has no input derivatives, they are held. The scale is the range of each output
     in the slow run; that of other outputs than displacement is at least their nominal.
     """
-    segment = 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
-    slow, fast = signals_of(model, segment), signals_of(model, 5e-4)
+    slow, fast = signals_of(model, reference_run.segment(model)), signals_of(model, 5e-4)
     grids = {step: _grid(step, slow.times[-1]) for step in _SLOW_STEPS}
     times = np.unique(np.concatenate([*grids.values(), slow.times]))
     linear = expected_outputs(model, times, slow)
@@ -232,7 +230,7 @@ def _grid(step: float, end: float) -> FloatArray:
 
 
 #: Errors are stated with two digits, and what they are compared with errs too.
-_ROUNDING, _OWN_ERROR = 1.06, 1e-8
+_ROUNDING, _REFERENCE_ERROR = 1.06, 1e-8
 #: Steps of the run with longer communication steps, and the voltage that is straight in between.
 _AT_ONCE, _STRAIGHT = 10, "ramps and holds"
 #: The reference restarts at every knot of a voltage; with more of them the simulator computes it.
@@ -241,14 +239,14 @@ _MOST_KNOTS = 50
 
 @dataclass(frozen=True)
 class StatedStep:
-    """What an FMU says of its fixed step [s]: the largest error by voltage, over the range."""
+    """The stated fixed step [s] of an FMU, and the largest error over the range by voltage."""
 
     step: float
     errors: Mapping[str, float]
 
 
 def stated_step(directory: Path) -> StatedStep | None:
-    """Return what an unpacked FMU says of its fixed step; None if it has none.
+    """Return the stated fixed step of an unpacked FMU; None if it has none.
 
     Raises InputError if it does not state an error for each reference voltage, as JSON.
     """
@@ -272,7 +270,7 @@ def fixed_truth(model: Model, version: int, stated: StatedStep) -> Truth:
     """Return what an FMU with a fixed step is compared with; runs that fail are a problem."""
     truth = bare_truth(model)
     try:
-        names = (shown_output(model),)
+        names = (main_output(model),)
         runs = [_run(model, name, stated, held=version == 3) for name in VOLTAGES]
         runs.append(_run(model, _STRAIGHT, stated, held=version == 3, every=_AT_ONCE))
     except BREAKDOWNS as error:
@@ -297,7 +295,7 @@ def _run(model: Model, name: str, stated: StatedStep, *, held: bool, every: int 
     signals = Signals(model.input_names, times[kept], inputs[kept], held)
     exact = has_reference(model) and len(signals.times) <= _MOST_KNOTS
     compute = expected_outputs if exact else simulated
-    column = model.output_names.index(shown_output(model))
+    column = model.output_names.index(main_output(model))
     expected = compute(model, times, signals)[:, column : column + 1]
     scale = np.ptp(expected, axis=0)
     error = max(stated.errors.values()) if held and every > 1 else stated.errors[name]
@@ -306,7 +304,7 @@ def _run(model: Model, name: str, stated: StatedStep, *, held: bool, every: int 
         times,
         signals,
         expected,
-        _ROUNDING * error + _OWN_ERROR,
+        _ROUNDING * error + _REFERENCE_ERROR,
         scale=np.where(scale > 0.0, scale, model.output_nominals()[column]),
         by="reference" if exact else "simulator",
     )

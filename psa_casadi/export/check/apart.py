@@ -1,9 +1,8 @@
-"""The foreign code of an FMU runs in a process of its own, with limits of time and memory.
+"""The foreign code of an FMU runs in a separate process, with limits of time and memory.
 
-Its task lies in a folder of its own. What it finds it appends to a file there, so that the rows
-that were finished stay, however it ends. Each line begins with a word that only the two processes
-know: code that ends the process early, or writes where it should not, can neither finish nor add a
-row.
+The process reads its task in a folder and appends its rows to a file there, so that the finished
+rows stay, however it ends. Each line starts with a word that only the two processes know: code that
+ends the process early, or writes where it should not, can neither finish nor add a row.
 """
 
 import json
@@ -28,7 +27,7 @@ from psa_casadi.processes import memory_of_process
 
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"
-#: What is said of checks that do not come to an end.
+#: The message of checks that do not come to an end.
 OVERTIME = (
     "did not come back within the time limit of {:g} s of the whole check (--timeout sets it)"
 )
@@ -37,7 +36,7 @@ _TASK, _ROWS, _PRINTED = "task", "rows", "printed"
 #: How often the process looks at its memory [s], and from which share of it on it is full.
 _LOOK, _FULL = 0.02, 0.9
 #: How much a file of the process may hold [bytes], as what it prints goes to one; how much of that
-#: is told.
+#: a message has.
 _MOST_PRINTED, _LAST = 256 << 20, 300
 #: What a process ends with that cannot write its rows any more.
 _CLOSED = 71
@@ -47,7 +46,7 @@ _DISTURBED = "the FMU disturbed the channel of the results: "
 def rows_apart(task: Task, end: float) -> list[CheckRow]:
     """Return the rows of a task, and how its process ended unless that was well.
 
-    `end` is when it ends at the latest, as `time.monotonic` tells it.
+    `end` is when it ends at the latest, a value of `time.monotonic`.
 
     Raises PsaError if it did not come as far as the code of the FMU.
     """
@@ -67,25 +66,25 @@ def rows_apart(task: Task, end: float) -> list[CheckRow]:
                 code, problem = 0, f"the FMU {OVERTIME.format(task.timeout)}"
             finally:
                 kill_group(child)
-            result = _Found(task.key, rows.read())
+            result = _Lines(task.key, rows.read())
             printed.seek(max(0, printed.seek(0, os.SEEK_END) - _LAST))
             complained += printed.read()
     problem = problem or result.problem or _ended(code, result, task.memory)
     if not problem:
         return result.rows
-    if statement := complained.decode(errors="replace").strip()[-_LAST:]:
-        problem += f"; the last it printed: {statement}"
-    if not result.rows and not result.begun:  # nothing of the FMU has run
+    if last := complained.decode(errors="replace").strip()[-_LAST:]:
+        problem += f"; the last it printed: {last}"
+    if not result.rows and not result.running:  # nothing of the FMU has run
         raise PsaError(f"The process for the code of the FMU did not start: {problem}.")
-    return [*result.rows, stopped(result.begun or OUTSIDE, problem)]
+    return [*result.rows, stopped(result.running or OUTSIDE, problem)]
 
 
-class _Found:
-    """What the lines of a process say; `begun` is the check that ran when it ended."""
+class _Lines:
+    """The lines of a process, read; `running` is the check that ran when it ended."""
 
     def __init__(self, key: str, lines: bytes) -> None:
         self.rows: list[CheckRow] = []
-        self.begun, self.problem = "", ""
+        self.running, self.problem = "", ""
         self.complete = self.full = False
         for line in lines.decode(errors="replace").splitlines():
             word, _, text = line.partition(" ")
@@ -94,15 +93,15 @@ class _Found:
                 return
             kind, *content = json.loads(text)
             if kind == "begin":
-                self.begun = str(content[0])
+                self.running = str(content[0])
             elif kind == "row":
                 self.rows.append(CheckRow(*content))
-                self.begun = ""
+                self.running = ""
             self.full = self.full or kind == "memory"
             self.complete = kind == "end"
 
 
-def _ended(code: int, result: _Found, memory: int) -> str:
+def _ended(code: int, result: _Lines, memory: int) -> str:
     """Return what was wrong with a process that ended by itself, "" if nothing was."""
     if code == 0 and result.complete:
         return ""
@@ -113,7 +112,7 @@ def _ended(code: int, result: _Found, memory: int) -> str:
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
         return f"the FMU ended its process by the signal {name}"
-    text = f"{code:#x}" if code > 255 else str(code)  # Windows tells faults by such codes
+    text = f"{code:#x}" if code > 255 else str(code)  # such codes are faults of Windows
     when = "when it was unloaded" if result.complete else "before the checks were done"
     return f"the FMU ended its process with exit code {text} {when}"
 
@@ -129,21 +128,21 @@ def main() -> None:
     for stream, target in ((0, os.open(os.devnull, os.O_RDONLY)), (1, printed), (2, printed)):
         os.dup2(target, stream)
 
-    def tell(*content: object) -> None:
+    def write(*content: object) -> None:
         try:
             os.write(rows, f"{task.key} {json.dumps(content)}\n".encode())
         except OSError:
             os._exit(_CLOSED)
 
-    _limit(task.memory, lambda: tell("memory"))
+    _limit(task.memory, lambda: write("memory"))
     try:
         for check in checks_of(task):
-            tell("begin", check.name)
-            tell("row", *astuple(check.row()))
+            write("begin", check.name)
+            write("row", *astuple(check.row()))
     except MemoryError:
-        tell("memory")
+        write("memory")
         raise
-    tell("end")
+    write("end")
 
 
 def _limit(memory: int, act: Callable[[], None]) -> None:

@@ -54,7 +54,7 @@ class Binary:
 
 
 def has_lief() -> bool:
-    """Say whether binaries can be inspected."""
+    """Return whether binaries can be inspected."""
     return find_spec("lief") is not None
 
 
@@ -128,7 +128,7 @@ def misplaced_binaries(archive: Archive) -> Iterator[str]:
 def libc_row(archive: Archive, *, portable: bool = False) -> CheckRow:
     """No Linux binary needs a newer GNU C library than the systems have that it is for.
 
-    One for this machine's platform is for systems like this one, as its own compiler makes it. All
+    One for this machine's platform is for systems like this one, as its compiler makes it. All
     others, and every one if `portable`, are for systems from 2.17 (of 2012) on, or 2.27 on RISC-V.
     """
     problems, oldest = [], []

@@ -1,7 +1,9 @@
 """Calling sequences of an FMU that must succeed, and what must come of them."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +20,7 @@ def _inputs(fmu: Fmu, share: float) -> dict[str, float]:
 
 
 def _run(
-    instance: Instance, size: float, shares: tuple[float, ...], begin: float = 0.0
+    instance: Instance, size: float, shares: Sequence[float], begin: float = 0.0
 ) -> FloatArray:
     """Step with inputs of some shares of their nominals; return outputs and states of each step."""
     fmu = instance.fmu
@@ -89,17 +91,30 @@ def communication_points(fmu: Fmu) -> Problems:
 
 def independent_instances(fmu: Fmu) -> Problems:
     """Two instances stepped in turn give what each gives alone."""
-    size, shares = fmu.step_size, ((0.2, 0.9, 0.4), (1.0, 0.1, 0.6))
+    start, shares = partial(fmu.start, CO_SIMULATION), ((0.2, 0.9, 0.4), (1.0, 0.1, 0.6))
+    for k, alone, row in taken_in_turn(start, _run, fmu.step_size, shares):
+        if _differ(alone, row):
+            yield f"two instances disturb each other in step {k}"
+
+
+def taken_in_turn(
+    start: Callable[[], AbstractContextManager[Instance]],
+    run: Callable[[Instance, float, Sequence[float], float], FloatArray],
+    size: float,
+    shares: Sequence[Sequence[float]],
+) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+    """Yield the number of each step of two instances in turn, its results alone and in turn.
+
+    `run` takes an instance through steps of a `size` [s], an input share each, from a time on.
+    """
     alone = []
-    for item in shares:
-        with fmu.start(CO_SIMULATION) as slave:
-            alone.append(_run(slave, size, item))
-    with fmu.start(CO_SIMULATION) as first, fmu.start(CO_SIMULATION) as second:
-        for k in range(3):
-            for slave, item, expected in zip((first, second), shares, alone, strict=True):
-                row = _run(slave, size, item[k : k + 1], k * size)
-                if _differ(row[0], expected[k]):
-                    yield f"two instances disturb each other in step {k + 1}"
+    for listed in shares:
+        with start() as instance:
+            alone.append(run(instance, size, listed, 0.0))
+    with start() as first, start() as second:
+        for k in range(len(shares[0])):
+            for instance, listed, rows in zip((first, second), shares, alone, strict=True):
+                yield k + 1, rows[k], run(instance, size, listed[k : k + 1], k * size)[0]
 
 
 def parameter_changes(fmu: Fmu) -> Problems:
@@ -146,19 +161,19 @@ def snapshots(fmu: Fmu) -> Problems:
     size, shares = fmu.step_size, (0.9, 0.1, 0.7)
     with fmu.start(CO_SIMULATION) as slave:
         _run(slave, size, (0.5, 1.0))
-        snapshot = slave.save()
-        data = slave.serialize(snapshot)
+        snapshot = slave.fmi.getFMUState()
+        data = slave.fmi.serializeFMUState(snapshot)
         first = _run(slave, size, shares, 2 * size)
-        slave.restore(snapshot)
+        slave.fmi.setFMUState(snapshot)
         if _differ(first, _run(slave, size, shares, 2 * size)):
             yield "a restored state does not replay the same bits"
-        slave.drop(snapshot)
+        slave.fmi.freeFMUState(snapshot)
         with fmu.open(CO_SIMULATION) as other:
-            copy = other.deserialize(data)
-            if other.serialize(copy) != data:
+            copy = other.fmi.deserializeFMUState(data)
+            if other.fmi.serializeFMUState(copy) != data:
                 yield "a state read back from bytes is serialised to other bytes"
-            other.restore(copy)
-            other.drop(copy)
+            other.fmi.setFMUState(copy)
+            other.fmi.freeFMUState(copy)
             if _differ(first, _run(other, size, shares, 2 * size)):
                 yield "a state moved to another instance does not replay the same bits"
         flipped = ((len(data) * share // 16, "damaged") for share in range(4, 16))
@@ -169,7 +184,7 @@ def snapshots(fmu: Fmu) -> Problems:
         wrongs += [(data[:-1], "truncated"), (data[:8], "truncated"), (data + b"\0", "lengthened")]
         for wrong, what in wrongs:
             try:
-                slave.drop(slave.deserialize(wrong))
+                slave.fmi.freeFMUState(slave.fmi.deserializeFMUState(wrong))
             except FmuError:
                 continue
             yield f"a {what} serialised state is accepted"

@@ -38,13 +38,13 @@ from psa_casadi.strict_json import read_json
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 
-#: What a whole check, and the foreign code in it, may take unless told otherwise [s], [bytes].
+#: Default limits of a whole check [s], and of the foreign code in it [bytes].
 TIMEOUT, MEMORY = 600.0, 4 << 30
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """All checks of one FMU; `compared` says whether there was a model to compare with.
+    """All checks of one FMU; `compared` is true if there was a model to compare with.
 
     `left_out` names the checks that this kind of FMU has nothing for, or that need lief where that
     is not installed. A `foreign` FMU was checked by the standard alone.
@@ -82,15 +82,15 @@ def check_fmu(
     """Check an FMU of FMI 2.0 or 3.0: description, binaries, calls, derivatives, trajectories.
 
     It is compared with `model`, else with the model it carries (resources/model.json), else with
-    none. `effects` are own ones that the model inside may have. Sensor and environment of the model
-    are left out if the FMU leaves them out. A check that breaks down is a row that did not pass;
-    the others still run, except those that need an instance if there is none.
+    none. `effects` are the user's effects that the model inside may have. Sensor and environment of
+    the model are left out if the FMU leaves them out. A check that breaks down is a row that did
+    not pass; the others still run, except those that need an instance if there is none.
 
     With `evidence` the run of the model's evidence is played again, and so are those of `records`
     that stand behind it: is the error what the model states?
 
-    This runs the code of the FMU, in a process of its own: `timeout` [s] is what all checks
-    together may take, `memory` [bytes] what the code may take beside Python's own, on Linux.
+    This runs the code of the FMU, in a separate process: `timeout` [s] is what all checks
+    together may take, `memory` [bytes] what the code may take in addition to Python, on Linux.
     However it ends, its rows are kept, and the check that ran did not pass. It is no sandbox: files
     and network are open to the code. An archive that would leave its folder, has links, is damaged
     or a bomb is not unpacked, and nothing of it runs.
@@ -98,15 +98,15 @@ def check_fmu(
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
     Without lief (`pip install lief`) the binaries are not inspected.
 
-    A `foreign` one, by default every one that another tool made and for which no model is given, is
+    A `foreign` one, by default every one of another tool without a `model`, is
     checked by the standard alone: a row fails where a clause is violated, and notes what else a
     buyer should know. See docs/howto/fmu_export.md.
 
     Of an FMU with a fixed step the errors that it states are measured again; `left_out` names the
     checks that mean nothing there.
 
-    Raises InputError if the file is no FMU, if evidence is asked of one with a fixed step, or if
-    `portable` is asked without lief.
+    Raises InputError if the file is no FMU, for `evidence` of one with a fixed step, and for
+    `portable` without lief.
     """
     path = Path(path)
     if portable and not binaries.has_lief():
@@ -124,7 +124,10 @@ def check_fmu(
     chosen: list[Model] = [model] if model else []
     end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
-        if _is_foreign(archive, foreign, model):
+        if foreign is None:
+            tool = str(archive.description.generationTool)
+            foreign = model is None and not tool.startswith("psa_casadi")
+        if foreign:
             rows += [c.row() for c in described(archive, description.invalid)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
             rows += rows_apart(task, end)
@@ -167,12 +170,6 @@ def _demand_zip(path: Path) -> None:
         raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
 
 
-def _is_foreign(archive: Archive, wanted: bool | None, model: Model | None) -> bool:
-    if wanted is not None:
-        return wanted
-    return model is None and not str(archive.description.generationTool).startswith("psa_casadi")
-
-
 def _described(
     archive: Archive, chosen: list[Model], effects: tuple[Component, ...]
 ) -> Iterator[Check]:
@@ -208,17 +205,17 @@ def _described(
 def as_exported(archive: Archive, model: Model) -> Model:
     """Return the model as the exporter took it: whole, or without sensor and environment.
 
-    And with the output that tells how far a run is outside of what the records have shown. That
-    sensor and environment are left out is told by all their variables: a sensor's effect need not
-    have an output of its own.
+    With the output for how far a run is outside of the records' range, where the FMU has it. Sensor
+    and environment are left out where all their variables are missing: a sensor's effect need not
+    have an output.
     """
     inside, apart = (
         {v.name for c in model.components if c.in_plant is plant for v in _variables(c)}
         for plant in (True, False)
     )
-    item = apart - inside  # what only sensor and environment have
-    described = {v.name for v in archive.description.modelVariables}
-    exported = model.plant() if item and item.isdisjoint(described) else model
+    outside = apart - inside  # variables of sensor and environment alone
+    without = outside and outside.isdisjoint(archive.references)
+    exported = model.plant() if without else model
     if VALIDITY in archive.names("output") and exported.evidence is not None:
         exported = with_validity(exported)
     return description.published_as(archive, exported)

@@ -1,4 +1,4 @@
-"""What modelDescription.xml says by itself, without a call."""
+"""The checks of modelDescription.xml, without a call of the FMU."""
 
 import math
 import re
@@ -65,7 +65,7 @@ def undefined_units(archive: Archive) -> Iterator[str]:
 
 
 def inconsistent_units(archive: Archive) -> Iterator[str]:
-    """A unit is defined as what its name says, and a derivative has the unit of its state per s."""
+    """A unit is defined as its name is, and a derivative has the unit of its state per s."""
     powers = {}
     for unit in archive.description.unitDefinitions:
         base = unit.baseUnit
@@ -121,12 +121,12 @@ def missing_notices(archive: Archive) -> Iterator[str]:
 def published_as(archive: Archive, model: Model) -> Model:
     """Return the model with author, version and terms as the FMU states them.
 
-    They are given at the export, and say nothing of what the model computes.
+    They are arguments of the export and change nothing that the model computes.
     """
-    table = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
-    unstated = publication.terms_of_code()
-    item = {name: text for name, text in table.items() if text != unstated.get(name)}
-    return replace(model, publication=Publication(**item))
+    texts = {f.name: getattr(archive.description, f.name) or "" for f in fields(Publication)}
+    defaults = publication.terms_of_code()
+    stated = {name: text for name, text in texts.items() if text != defaults.get(name)}
+    return replace(model, publication=Publication(**stated))
 
 
 #: The checks by the names of their rows.
@@ -199,14 +199,14 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     """Exported again, the model gives the same description, token and sources, byte for byte.
 
     Another version of CasADi writes other C for the same equations, and so does this one where they
-    were read from text: what was written stands then as it is, and its token says whether it was
-    changed since.
+    were read from text: the sources are then taken as they are; their token shows whether they
+    were changed.
     """
     tool = str(archive.description.generationTool)
     if tool != generation_tool():
         yield f"it was exported by {tool}, this is {generation_tool()}; export it again to compare"
         return
-    table = {
+    contents = {
         p.relative_to(archive.directory).as_posix(): p.read_bytes()
         for p in archive.directory.rglob("*")
         if p.is_file()
@@ -214,11 +214,11 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     untouched = {}
     if _other_casadi(archive) or _read_from_text(model):
         places = {name: f"sources/{name}" for name in sources.FROM_CASADI}
-        untouched = {n: table[p].decode("utf-8") for n, p in places.items() if p in table}
+        untouched = {n: contents[p].decode() for n, p in places.items() if p in contents}
     step = sources.fixed_step_of(archive.directory)
     fixed = planned_step(model, archive.identifier, archive.version, step) if step else None
     token, texts, xml = sources.exported_texts(
-        model, archive.identifier, archive.version, fixed, given=untouched
+        model, archive.identifier, archive.version, fixed, kept=untouched
     )
     if token != archive.token:
         yield f"the token is {archive.token}, not {token}"
@@ -227,16 +227,16 @@ def unreproducible_parts(archive: Archive, model: Model) -> Iterator[str]:
     if fixed:
         expected[sources.FIXED_ENTRY] = sources.fixed_entry(fixed).decode("utf-8")
     for name, text in sorted(expected.items()):
-        if name not in table:
+        if name not in contents:
             yield f"{name} is missing"
-        elif table[name] != text.encode("utf-8"):
+        elif contents[name] != text.encode("utf-8"):
             yield f"{name} differs"
-    for name in sorted({n for n in table if n.startswith("sources/")} - set(expected)):
+    for name in sorted({n for n in contents if n.startswith("sources/")} - set(expected)):
         yield f"{name} is not among the sources of the model"
 
 
 def reproducible(archive: Archive, model: Model) -> Iterable[str] | CheckRow:
-    """Return what differs in the export made again; a row says what was taken as it is."""
+    """Return what differs in the export made again, or a row with what was taken as it is."""
     problems, other = list(unreproducible_parts(archive, model)), _other_casadi(archive)
     if problems:
         return problems
@@ -258,7 +258,7 @@ def _other_casadi(archive: Archive) -> str:
     """Return the version of CasADi that an FMU was made with; empty if it is the one in use."""
     source = archive.directory / "sources" / "model.c"
     try:
-        statement = _CASADI.search(source.read_text(encoding="utf-8"))
+        match = _CASADI.search(source.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError):
         return ""
-    return statement[1] if statement and statement[1] != ca.CasadiMeta.version() else ""
+    return match[1] if match and match[1] != ca.CasadiMeta.version() else ""

@@ -10,7 +10,7 @@ from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
 from psa_casadi.export.fmu import evidence as carried
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model
@@ -46,7 +46,7 @@ def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
 def repeated(
     archive: Archive, model: Model | None, records: Sequence[Record]
 ) -> tuple[CheckRow | Playback, ...]:
-    """Return what `psa check --evidence` tells: rows that need no run, and runs to play."""
+    """Return the checks of `psa check --evidence`: rows that need no run, and runs to play."""
     evidence = model.evidence if model else None
     if model is None or evidence is None:
         return (Check("evidence", lambda: (_NONE,)).row(),)
@@ -83,7 +83,7 @@ def repeated(
 def _of_record(
     archive: Archive, model: Model, record: Record, run: RecordRun
 ) -> Playback | CheckRow:
-    """Return the run of a record, or the row that says why there is none."""
+    """Return the run of a record, or the row with the reason why there is none."""
     kind = "held-out" if run.held_out else "fitted"
     name = f"{kind} error of {record.name}"
     present = {c.name for c in model.components}

@@ -19,8 +19,7 @@ from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
-from psa_casadi.export.importer.masters import co_simulate, integrate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.units import FloatArray
 
 #: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
@@ -29,7 +28,7 @@ RUN_LIMITS = {2: 1e-5, 3: 5e-4}
 #: How far a repeated error may be off, as a share of what is stated.
 ERROR_LIMIT = 0.02
 _TOLERANCE = 1e-9
-#: What a held input may move in a step, over its range, in at most so many steps between samples.
+#: What a held input may move in a step, over its range; the most steps between two samples.
 _STEP, _MOST_STEPS = 1e-3, 1000
 
 
@@ -110,8 +109,8 @@ class Task:
     """What is to be checked: an FMU by its path (for messages) and its unpacked folder.
 
     `truth` is what to compare with, `playbacks` are runs to repeat. All checks may take `timeout`
-    [s], the foreign code `memory` [bytes] beside Python's own; that is limited on Linux only.
-    `key` marks what its process tells. A `foreign` FMU is checked by the standard alone.
+    [s], the foreign code `memory` [bytes] in addition to Python; that is limited on Linux only.
+    `key` marks the lines of its process. A `foreign` FMU is checked by the standard alone.
     """
 
     path: Path

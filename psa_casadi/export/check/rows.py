@@ -26,10 +26,10 @@ _LONGEST = 4000
 
 @dataclass(frozen=True)
 class CheckRow:
-    """One check: what was found, how much is allowed, and what is wrong or was compared.
+    """One check: its figure, the limit, and a remark on what is wrong or was compared.
 
-    `clause` is that of the standard, of a foreign FMU's; `noted` says that it passed, and that the
-    remark is something to know.
+    `clause` is that of the standard, of a foreign FMU's; `noted` is true if it passed with a remark
+    to know.
     """
 
     name: str
@@ -78,6 +78,6 @@ def stopped(name: str, remark: str) -> CheckRow:
 
 
 def plain(remark: str) -> str:
-    """Return a text on one line that cannot steer a terminal; it may repeat what an FMU says."""
+    """Return a text on one line that cannot steer a terminal; it may repeat texts of an FMU."""
     line = "".join(c if c.isprintable() else "?" for c in " ".join(remark.split()))
     return line if len(line) <= _LONGEST else f"{line[:_LONGEST]} ..."

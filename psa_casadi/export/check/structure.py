@@ -1,7 +1,7 @@
 """What modelDescription.xml claims about an FMU, measured on its binary."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ _ROUNDING = 1e-12
 _NOTHING = 1e-6
 #: Parts of a step in which its line is followed by values that are held.
 _PARTS = 50
-#: Rise of the inputs over a step, in nominal values: small beside the limits of a slew rate, else
+#: Rise of the inputs over a step, in nominal values: small against the limits of a slew rate, else
 #: large enough to leave a dead band.
 _RISES = (1e-3, 1e-1)
 #: Changes of states, over the rise, below which the inputs count as without effect.
@@ -53,9 +53,9 @@ def random_point(fmu: Fmu, generator: np.random.Generator) -> dict[str, float]:
 
 def evaluate(instance: Instance, point: dict[str, float], unknowns: list[str]) -> FloatArray:
     """Return unknowns at a point."""
-    fmu = instance.fmu
-    states = np.array([point[n] for n in fmu.states()])
-    others = {n: v for n, v in point.items() if n not in fmu.states() and n != "time"}
+    names = instance.fmu.state_elements
+    states = np.array([point[n] for n in names])
+    others = {n: v for n, v in point.items() if n not in names and n != "time"}
     instance.derivatives(point["time"], states, others)
     return instance.get(unknowns)
 
@@ -122,20 +122,32 @@ def directional_error(fmu: Fmu) -> float:
 
     Relative to the size of each unknown's derivative in nominal units of the knowns.
     """
-    seeds, step, worst = np.random.default_rng(2), 1e-6, 0.0
-    unknowns = _differentiated(fmu)
+    drawn, worst, unknowns = np.random.default_rng(2), 0.0, _differentiated(fmu)
     for instance, point in _at_points(fmu, 2):
-        knowns = [k for k in point if k != "time"]
-        seed = np.array([fmu.nominals[k] * seeds.uniform(-1.0, 1.0) for k in knowns])
-        ends = []
-        for way in (step, -step):
-            moved = {k: point[k] + way * d for k, d in zip(knowns, seed, strict=True)}
-            ends.append(evaluate(instance, {**point, **moved}, unknowns))
-        here = evaluate(instance, point, unknowns)
-        exact = instance.directional(unknowns, knowns, seed)
-        difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
-        worst = max(worst, float(np.max(difference / (np.abs(exact) + np.abs(here) + 1e-300))))
+        seed = {k: fmu.nominals[k] * drawn.uniform(-1.0, 1.0) for k in point if k != "time"}
+        worst = max(worst, float(np.max(difference_error(instance, point, unknowns, seed, 1e-6))))
     return worst
+
+
+def difference_error(
+    instance: Instance,
+    point: dict[str, float],
+    unknowns: list[str],
+    seed: Mapping[str, float],
+    step: float,
+) -> FloatArray:
+    """Return how far directional derivatives (n,) along a seed are from central differences.
+
+    Relative to the size of derivative and value; a difference is over `step` times the seed.
+    """
+    ends = []
+    for way in (step, -step):
+        moved = {k: point[k] + way * d for k, d in seed.items()}
+        ends.append(evaluate(instance, {**point, **moved}, unknowns))
+    here = evaluate(instance, point, unknowns)
+    exact = instance.directional(unknowns, list(seed), list(seed.values()))
+    difference = np.abs((ends[0] - ends[1]) / (2.0 * step) - exact)
+    return np.asarray(difference / (np.abs(exact) + np.abs(here) + 1e-300))
 
 
 def _differentiated(fmu: Fmu) -> list[str]:
@@ -150,7 +162,7 @@ def adjoint_error(fmu: Fmu) -> float:
     Of the whole matrix at a point, by columns and by rows, and in co-simulation through a step,
     there for at most `_MOST` knowns and unknowns: the step is made again for each column, and for
     every few knowns of a row. Each row is in nominal units of the knowns, relative to its largest
-    entry, or to what its unknown's value says is no more than rounding. Sampled states are held; a
+    entry, or to the rounding of its unknown's value. Sampled states are held; a
     step into which an instant falls is not differentiated.
     """
     unknowns = _differentiated(fmu)
@@ -175,7 +187,7 @@ def transposed_error(
 ) -> float:
     """Return the largest difference of the matrix by rows from the one by columns.
 
-    `here` are the values of the unknowns: entries that are nothing beside them are rounding.
+    `here` are the values of the unknowns: entries far below them are rounding.
     """
     columns = [instance.directional(unknowns, knowns, c) for c in np.eye(len(knowns))]
     rows = [instance.adjoint(unknowns, knowns, r) for r in np.eye(len(unknowns))]
@@ -245,7 +257,7 @@ def input_line_error(fmu: Fmu) -> float:
     """Return how far a step along the line is from where the inputs lead that follow it.
 
     As a share of what holding the inputs over that step changes, the larger one of two rises. Two
-    values are given, a step apart; then the line through them goes on over the next step. The same
+    values are set, a step apart; then the line through them goes on over the next step. The same
     is done by `_PARTS` short steps with values held that lie on it. What these leave, an instant
     of sampled states among them, is twice their difference from half as many at most, and is taken
     off. Inputs that move no state within a step leave nothing to compare: 0.
@@ -314,16 +326,16 @@ def event_indicators(fmu: Fmu) -> Iterator[str]:
 
 def _dead_or_not_turned(fmu: Fmu) -> Iterator[str]:
     """Yield the indicators that nothing moves, and those that an event leaves negative."""
-    names, observed = fmu.indicators(), []
+    names, values = fmu.indicators(), []
     for instance, point in _at_points(fmu, 8):
-        observed.append(evaluate(instance, point, names))
+        values.append(evaluate(instance, point, names))
         instance.require("EnterEventMode")
         instance.update_discrete_states()
         instance.require("EnterContinuousTimeMode")
         for name, z in zip(names, instance.get(names), strict=True):
             if not z >= 0.0:
                 yield f"'{name}' stays negative after an event"
-    for name, z in zip(names, np.array(observed).T, strict=True):
+    for name, z in zip(names, np.array(values).T, strict=True):
         if not np.ptp(np.abs(z)) > 0.0:
             yield f"'{name}' moves with nothing"
 

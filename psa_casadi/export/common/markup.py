@@ -28,7 +28,7 @@ def force_scale(model: Model) -> str:
 
 
 def what_it_is(model: Model) -> str:
-    """Return the model's own description, else those of its components."""
+    """Return the model's description, else those of its components."""
     return model.description or "; ".join(c.description for c in model.components)
 
 
@@ -93,7 +93,7 @@ def xml_text(template: str, **options: object) -> str:
 def default_span(model: Model) -> float:
     """Return how long the default experiment takes [s].
 
-    Two digits are given, as the last ones of an eigenvalue differ from machine to machine.
+    It has two digits, as the last ones of an eigenvalue differ from machine to machine.
     """
     return float(f"{40.0 * time_scale(model):.2g}")
 

@@ -3,7 +3,7 @@
 The uncertainty is the mean, pairs of sigma points and random samples. A parameter that spans
 decades is spread in its logarithm, as its interval is. With C the covariance in these coordinates
 and L L^T = C (Cholesky), a pair of sigma points is the mean plus and minus one column of L: the
-variance of anything smooth that a model says is the sum, over the pairs, of the squared half
+variance of any smooth result of a model is the sum, over the pairs, of the squared half
 differences. The samples are the mean plus L z, z standard normal.
 
 Source: SSP 1.0, section 6 (system structure parameter values).
@@ -83,7 +83,7 @@ def set_text(name: str, rows: Sequence[Row], kinds: Mapping[str, str] | None = N
 
 Sets = Mapping[str, Mapping[str, float]]
 
-#: Random samples unless told otherwise, and the most.
+#: Random samples by default, and the most.
 SAMPLES, MOST_SAMPLES = 20, 999
 #: Draws for one sample until it lies within the bounds; the last one is put on them.
 _DRAWS = 200
@@ -93,11 +93,11 @@ _LARGEST = 500.0
 
 
 def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
-    """Return sets of the parameters that were found together, by name; values in SI units.
+    """Return sets of the parameters that have a covariance, by name; values in SI units.
 
-    `mean`, the pairs `sigma_01_plus`, `sigma_01_minus`, ... and `sample_01`, ... as many as asked
-    for, all within the bounds. Empty for a model without a covariance. The same model gives the
-    same sets.
+    `mean`, the pairs `sigma_01_plus`, `sigma_01_minus`, ... and `sample_01`, ... up to the
+    number of samples, all within the bounds. Empty for a model without a covariance. The same model
+    gives the same sets.
     """
     covariance = model.evidence.covariance if model.evidence else None
     if covariance is None or not covariance.names:
@@ -114,7 +114,7 @@ def posterior_sets(model: Model, samples: int = SAMPLES) -> Sets:
         return np.asarray(np.where(log, mean * factors, mean + by), dtype=float)
 
     def within(values: FloatArray) -> dict[str, float]:
-        """Put values with so many digits on the bounds, what has overflowed to nan on the mean."""
+        """Return values of `_DIGITS` digits within the bounds; nan (an overflow) is the mean."""
         digits = [float(f"{v:.{_DIGITS}g}") for v in values.tolist()]
         kept = np.clip(np.where(np.isnan(digits), mean, digits), low, high)
         return dict(zip(names, kept.tolist(), strict=True))

@@ -31,7 +31,7 @@ def published(model: Model) -> dict[str, str]:
 
 
 def terms_of_code() -> dict[str, str]:
-    """Return copyright and license of the C code, for a model that does not state its own."""
+    """Return copyright and license of the C code, for a model that states none."""
     return {"copyright": f"C code: {copyright_line()}", "license": _CODE_LICENSE}
 
 
@@ -66,9 +66,9 @@ def license_text(model: Model, fmi: int) -> str:
 def refuse_foreign(structure: Structure, what: str) -> None:
     """Raise InputError for a model with an FMU in it; `what` it would become, as "an FMU"."""
     if structure.foreign:
-        (item, *_) = (c for c in structure.components if c.foreign)
+        part = next(c for c in structure.components if c.foreign)
         raise InputError(
-            f"The model has an FMU in it ('{item.name}': {item.source}), which is a binary without"
+            f"The model has an FMU in it ('{part.name}': {part.source}), which is a binary without"
             f" equations to write as {what}. Effects at its inputs and outputs can stand around it"
             " in an SSP: psa.export_extended, or psa export ssp --model MODEL.json."
         )

@@ -11,9 +11,9 @@ from markupsafe import Markup, escape
 _LINE_ENDS = {ord(c): f"&#{ord(c)};" for c in "\t\n\r"}
 
 
-def filled(template: str, **given: object) -> str:
+def filled(template: str, **values: object) -> str:
     """Return a template of the folder `templates` with its values, escaped in HTML and XML."""
-    return _environment().get_template(template).render(given)
+    return _environment().get_template(template).render(values)
 
 
 @cache

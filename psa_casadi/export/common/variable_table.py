@@ -17,7 +17,7 @@ class Variable:
 
     `kind` is time, state, derivative, input, output, parameter, indicator (zero where a derivative
     has a kink), sampled (a state that changes at sample instants only) or option (how the FMU
-    begins and takes its inputs, no part of the model); `index` is its place in the vector of its
+    starts and takes its inputs, no part of the model); `index` is its place in the vector of its
     kind; the value reference is the place in the table, from 1 on. Only a state, an input, a
     parameter, an option and a sampled state have a `start`; a derivative has no nominal; an
     indicator, of which only the sign counts, has neither unit nor nominal.
@@ -34,10 +34,10 @@ class Variable:
     bounds: tuple[float, float] | None = None
 
 
-#: Share of the largest velocity, stroke times resonance, that runs show: solvers of importers take
+#: Share of the largest velocity, stroke times resonance, that runs reach: solvers of importers take
 #: their absolute tolerance from the nominal value of a state. With 1 CVode's velocity erred by its
 #: whole range, with 0.01 CVode gave up on the ringing of an underdamped stack.
-_SHOWN = 0.1
+_REACHED = 0.1
 #: How an importer without derivatives of inputs (FMI 3.0) gets along with coarse steps.
 INPUT_LINE = Variable(
     "input_line", "option", 0, "1",
@@ -75,9 +75,9 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
 
     def declared(kind: str, listed: Sequence[State | Input | Output]) -> Iterator[Variable]:
         for i, q in enumerate(listed):
-            displayed = _SHOWN if kind == "state" and q.nominal is velocity_scale else 1.0
+            share = _REACHED if kind == "state" and q.nominal is velocity_scale else 1.0
             start = None if isinstance(q, Output) else q.start
-            size = displayed * nominal_value(q.nominal, values)
+            size = share * nominal_value(q.nominal, values)
             yield Variable(q.name, kind, i, q.unit, q.description, q.display_unit, start, size)
 
     table = [

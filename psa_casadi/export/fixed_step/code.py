@@ -58,8 +58,8 @@ PRECISIONS = {
 class Printer:
     """Prints expressions of named places; equal numbers are computed once.
 
-    A number stands in a variable until its last use, which is free for another one then: however
-    long the code, its stack frame stays small, whatever the compiler optimises.
+    A variable holds a number until its last use, and is free for another one then: the stack frame
+    stays small for code of any length, at any level of optimisation.
     `places` names the letters of symbols ("x", "v", "t") and gives the C text of their elements.
     """
 
@@ -195,9 +195,9 @@ class CodePlan:
     """What is to be generated: a model's step, how often it is taken in a call, and how it looks.
 
     `step` is the time between two calls [s], `substeps` how many `expression`s it takes. With
-    `held` inputs a value holds over the step that it is given for; else it is reached at its end,
-    along a line from the value before. An instant of the sampled states ends `every` so many
-    calls, 0 where there are none. A voltage beyond `limit` [V], up or down, is limited to it.
+    `held` inputs a value holds over its step; else it is reached at the end of the step, along a
+    line from the value before. An instant of the sampled states ends each `every` calls, 0 where
+    there are none. A voltage beyond `limit` [V], up or down, is limited to it.
     """
 
     model: Model
@@ -297,7 +297,7 @@ def function_code(plan: CodePlan, function: str) -> str:
     lines, texts = printer.lines([change])
     text = "double t, double *x, const double *u, const double *change"
     return filled(
-        "fixed_function.c", function=function, given=text, lines=lines, texts=texts, plan=plan,
+        "fixed_function.c", function=function, arguments=text, lines=lines, texts=texts, plan=plan,
         nothing=_nothing(plan), inputs=len(s.inputs),
     )  # fmt: skip
 
@@ -329,7 +329,7 @@ class _Block:
     reads: bool
 
     def uses(self, word: str) -> bool:
-        """Whether a word stands in the code."""
+        """Whether a word is in the code."""
         return any(word in text for text in (*self.lines, *self.texts))
 
 

@@ -86,7 +86,7 @@ def played_inputs(model: Model, shape: FloatArray) -> FloatArray:
     return u
 
 
-def shown_output(model: Model) -> str:
+def main_output(model: Model) -> str:
     """Return the name of the output that is compared: the displacement, or the first one."""
     return output_of(model) or model.output_names[0]
 
@@ -148,26 +148,26 @@ def reach(plan: CodePlan, texts: dict[str, str], allowed: float) -> float:
 def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
     """Return the largest error over the range of the output on inputs (n, nu)."""
     model = plan.model
-    output = model.output_names.index(shown_output(model))
+    output = model.output_names.index(main_output(model))
     x0 = np.array([q.start for q in model.structure.states])
     times = plan.step * np.arange(len(u), dtype=np.float64)
     hold = "zero" if plan.held else "linear"
     true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
-    # held inputs hold from the instant on that they are given for
-    item = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
+    # held inputs hold from their instant on
+    played = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
     size = float(np.ptp(true)) or float(model.output_nominals()[output])
-    worst = float(np.max(np.abs(item - true))) / size
+    worst = float(np.max(np.abs(played - true))) / size
     return worst if np.isfinite(worst) else float("inf")
 
 
-#: Substeps that are tried where none are asked for, and the error that is good enough.
+#: Substeps that are tried by default, and the error that is good enough.
 SUBSTEPS, GOOD = (1, 2, 4, 8), 1e-3
 #: Error beyond which a step is of no use.
 USELESS = 0.1
 #: Two times that differ by less than this share are one.
 _SAME = 1e-9
 _HELD = {"linear": False, "zero": True}
-#: Plans a model's step, or says why it has none.
+#: Returns the plan of a model's step with its source, or why it has none.
 Attempt = Callable[[Model], tuple[code.CodePlan, str] | str]
 
 
@@ -222,19 +222,24 @@ def fixed_step(
         fixed_steps.append(FixedStep(plan, texts, measured))
         if fixed_steps[-1].worst.error <= GOOD:
             break
-    good = [f for f in fixed_steps if f.worst.error <= GOOD]
-    best = (good or sorted(fixed_steps, key=lambda f: f.worst.error))[0]
-    if not best.worst.error <= USELESS:
-        raise InputError(_useless(best))
+    best = min(fixed_steps, key=lambda f: f.worst.error)
+    plan, worst = best.plan, best.worst
+    if not worst.error <= USELESS:
+        cure = "the step is too long for this model: take a shorter one, or more --substeps"
+        if not model.structure.states:
+            cure = f"{precision} precision is too coarse for this model: take double"
+        raise InputError(
+            f"With a step of {step:g} s in {plan.substeps} substeps the {main_output(model)} errs"
+            f" by {100 * worst.error:.3g} % of its range on {worst.voltage}; {cure}."
+        )
     # the voltage is limited to where the step is as good as on the reference ones
-    limit = reach(best.plan, best.texts, max(GOOD, best.worst.error))
-    plan = replace(best.plan, limit=limit)
+    plan = replace(plan, limit=reach(plan, best.texts, max(GOOD, worst.error)))
     sources = (header_code(plan, best.errors), code.source_code(plan))
     return FixedStep(plan, dict(zip(best.texts, sources, strict=True)), best.errors)
 
 
 def header_code(plan: code.CodePlan, errors: tuple[VoltageError, ...] = ()) -> str:
-    """Return the header; its comment tells the `errors` that were measured."""
+    """Return the header; its comment states the `errors` that were measured."""
     model = plan.model
     return filled(
         "fixed_step.h",
@@ -244,22 +249,10 @@ def header_code(plan: code.CodePlan, errors: tuple[VoltageError, ...] = ()) -> s
         errors=errors,
         steps=STEPS,
         voltages=VOLTAGES,
-        shown=shown_output(model) if errors else "",
+        output=main_output(model) if errors else "",
         limit_words=code.limit_words(plan.limit),
         licence="\n".join(code_license().splitlines()),
         tool=generation_tool(),
-    )
-
-
-def _useless(best: FixedStep) -> str:
-    plan, worst = best.plan, best.worst
-    cure = "the step is too long for this model: take a shorter one, or more --substeps"
-    if not plan.model.structure.states:
-        cure = f"{plan.precision.name} precision is too coarse for this model: take double"
-    return (
-        f"With a step of {plan.step:g} s in {plan.substeps} substeps the"
-        f" {shown_output(plan.model)} errs by {100 * worst.error:.3g} % of its range on"
-        f" {worst.voltage}; {cure}."
     )
 
 
@@ -288,8 +281,8 @@ def _planned(model: Model, attempt: Attempt) -> tuple[code.CodePlan, str]:
     if not isinstance(result, str):
         code.check_names(result[0])
         return result
-    item, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
-    for name in (c.name for c in model.components if c.name not in item):
+    base, blamed = {c.name for c in (*BASE, *SIMPLIFIED)}, []
+    for name in (c.name for c in model.components if c.name not in base):
         with suppress(InputError):  # where others need it
             if not isinstance(attempt(model.without([name])), str):
                 blamed.append(name)
@@ -390,10 +383,5 @@ def export_c(
     make_folder(folder)
     for file_name, text in result.texts.items():
         atomic_write(folder / file_name, text)
-    return CodeExport(
-        folder / f"{identifier}.h",
-        folder / f"{identifier}.c",
-        result.plan.substeps,
-        result.errors,
-        result.plan.limit,
-    )
+    header, source = (folder / f"{identifier}.{ending}" for ending in "hc")
+    return CodeExport(header, source, result.plan.substeps, result.errors, result.plan.limit)

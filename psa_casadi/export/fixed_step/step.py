@@ -1,6 +1,6 @@
 """One step of fixed length as an expression: a model's exact step with nothing left to decide.
 
-The linear part is taken exactly: with L' = M L + g(t) and g = r + s t + q t^2 beside M L(0), the
+The linear part is taken exactly: with L' = M L + g(t) and g = r + s t + q t^2 added to M L(0), the
 change over h is E_1 r + E_2 s + 2 E_3 q, where E_k is the k-fold integral of exp(M t) over the
 step: one exponential of M with three integrators (van Loan, IEEE Trans. Automatic Control 23 (1978)
 395). States along a driver's way (hysteresis) take two Rosenbrock steps of fourth order over it,
@@ -8,8 +8,8 @@ which meet where the driver turns, else in the middle. A port's values at start,
 parabola in time. Ports that feed back to what they depend on take two Newton steps. So every step
 costs the same, whatever happens in it.
 
-What does not split into a linear part and states along a way (a hysteresis that acts back on its
-own voltage, a limit of an amplifier, a stop) takes one Rosenbrock step as a whole. It is L-stable,
+What does not split into a linear part and states along a way (a hysteresis that acts back on
+its voltage, a limit of an amplifier, a stop) takes one Rosenbrock step as a whole. It is L-stable,
 so that fast lags settle and jumps of an input stay bounded. A kink inside a step is not looked for:
 the step has order two there, which the comparison at export measures, and substeps make small.
 
@@ -79,7 +79,7 @@ def along_the_way(
     """
     half, count = ends.half[driver], ends.x.numel()
     turned, share, turn = _turn(rates, half, ends.whole[driver], ends.step)
-    # where the legs meet: parabolas in time, but the driver's own value
+    # where the legs meet: parabolas in time, but for the driver
     change = 4.0 * share * (1.0 - share) * ends.half + share * (2.0 * share - 1.0) * ends.whole
     parts = [ends.x[i] + change[i] for i in range(count)]
     parts[driver] = ends.x[driver] + turn
@@ -97,7 +97,8 @@ def along_the_way(
     ) -> tuple[Expression, Expression, Expression]:
         """Return the driver's way over a leg, the states' changes at its begin's slopes, and all.
 
-        States beside the way go on a line from `origin` to `target`, from `begin` on for `share`.
+        States that are not along the way go on a line from `origin` to `target`, from `begin` on
+        for `share`.
         """
         duration = share * ends.step
         way = target[driver] - origin[driver]
@@ -198,7 +199,7 @@ def _responses(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return E_1, E_2 / step and 2 E_3 / step^2 (n, n each) at `share` of a `step` [s].
 
-    `nominal` (n,) are the states' usual sizes, which keep the exponential's numbers alike. What M
+    `nominal` (n,) are the states' usual sizes, which scale the exponential. What M
     does not join is exactly 0.
     """
     n = len(m)
@@ -218,7 +219,7 @@ def _responses(
 
 #: Newton steps of ports that feed back.
 _NEWTON = 2
-#: Instants of a step at which the ports are evaluated, beside its start.
+#: Instants of a step, after its start, at which the ports are evaluated.
 HALF, WHOLE = 0, 1
 SHARES = (0.5, 1.0)
 
@@ -301,12 +302,12 @@ class _Builder:
         slopes = []
         for i in range(len(rows)):
             scale = m[i, i] or 1.0
-            item = x[i] if m[i, i] else ca.SX(0)
+            diagonal = x[i] if m[i, i] else ca.SX(0)
             others = sum(
                 (m[i, j] / scale * x[j] for j in range(len(rows)) if j != i and m[i, j]), ca.SX(0)
             )
             inputs = sum((b[i, j] / scale * s.u[j] for j in range(b.shape[1]) if b[i, j]), ca.SX(0))
-            rest = item + inputs + others + self.c[i, 0] / scale
+            rest = diagonal + inputs + others + self.c[i, 0] / scale
             slopes.append(scale * (rest + low[i] if m[i, i] else rest))
         for k, port in enumerate(self.split.ports):
             slopes[rows.index(port.state)] += self.port[k]
@@ -323,8 +324,8 @@ class _Builder:
         """Return an expression at a node, where the states have changed as far as it is known."""
         s, share = self.split.structure, SHARES[node]
         there = [s.time + share * self.step, s.x + self._change(node), s.u + share * self.du]
-        inputs = with_numbers(self.model, expression)
-        return ca.substitute([inputs], [s.time, s.x, s.u], there)[0]
+        numeric = with_numbers(self.model, expression)
+        return ca.substitute([numeric], [s.time, s.x, s.u], there)[0]
 
     def _respond(self, k: int) -> None:
         """Add the response to a port, once its values at the half and the end are known."""
@@ -336,13 +337,13 @@ class _Builder:
             self.moved[node] += sloped * ramp + bent * square
 
     def _loop(self, members: Sequence[int]) -> None:
-        """Take ports that depend on their own responses: Newton steps from the start's values."""
+        """Take ports that depend on their responses: Newton steps from the start's values."""
         places = [(node, k) for k in members for node in range(len(SHARES))]
         guess = ca.SX.sym("guess", len(places))
         before = [ca.SX(q) for q in self.moved]
         self._take(places, guess)
-        items = [self._at(node, self.split.ports[k].value) for node, k in places]
-        miss = ca.vertcat(*items) - guess
+        ports = [self._at(node, self.split.ports[k].value) for node, k in places]
+        miss = ca.vertcat(*ports) - guess
         slopes = ca.jacobian(miss, guess)
         values = ca.vertcat(*[self.port[k] for _, k in places])
         for _ in range(_NEWTON):

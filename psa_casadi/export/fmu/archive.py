@@ -49,13 +49,13 @@ def export_fmu(
     same bytes. The file is written whole or not at all.
 
     A model with evidence (identified or diagnosed) takes it along: a page, meta data, a run to
-    repeat, and `parameter_sets` random sets of its parameters within their uncertainty, beside
+    repeat, and `parameter_sets` random sets of its parameters within their uncertainty, next to
     their mean and sigma points (0: none of them). `validity_output` adds the output
-    `outside_validity`, which tells how far a run has left what the records have shown.
+    `outside_validity`: how far a run has left the range of the records.
 
     With a `step` [s] the FMU is for co-simulation only and takes steps of this fixed length and of
     constant cost, as `export_c` writes them: communication steps are multiples of it and parameters
-    are constants. The description tells the error that was measured.
+    are constants. The description states the error that was measured.
 
     Raises InputError for an impossible name, an unknown platform or version, a model without
     states, or one that does not fit a fixed step, and MachineError if a compiler fails.
@@ -105,9 +105,9 @@ def planned_step(model: Model, identifier: str, fmi: int, step: float) -> FixedS
 
 
 def _companions(model: Model, fmi: int, samples: int, fixed: FixedStep | None) -> dict[str, bytes]:
-    """Return what is beside description, sources and binaries: for people and for other tools.
+    """Return the files other than description, sources and binaries, for people and other tools.
 
-    A model that cannot be simulated with its own values is exported without a reference run, and so
+    A model that cannot be simulated with its values is exported without a reference run, and so
     is one with a fixed step, which takes neither the run's parameters nor any step of its rows.
     """
     evidence: dict[str, bytes] = {}

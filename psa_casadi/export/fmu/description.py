@@ -104,10 +104,10 @@ def model_description(
     `fixed` step there is no model exchange, and parameters are constants.
     """
     second, table = fmi == 2, variable_table(model)
-    statement, span, places = describe(model), default_span(model), range(1, len(table) + 1)
+    description, span, places = describe(model), default_span(model), range(1, len(table) + 1)
     size = span / 1000.0
     if fixed:
-        statement += (
+        description += (
             f" Co-simulation by a fixed step of {fixed.plan.step:g} s, of which a communication"
             f" step is a multiple; largest error {fixed.worst.error:.1e} of the range"
             f" ({fixed.worst.voltage})."
@@ -120,7 +120,7 @@ def model_description(
         head={
             "modelName": model.name,
             "guid" if second else "instantiationToken": token,
-            "description": statement,
+            "description": description,
             **published(model),
             "generationTool": generation_tool(),
             "variableNamingConvention": "structured",
@@ -146,8 +146,8 @@ def _units(table: Iterable[Variable]) -> list[tuple[str, dict[str, str] | None, 
     displays: dict[str, set[str]] = {}
     for variable in table:
         if variable.unit:
-            displayed = displays.setdefault(variable.unit, set())
-            displayed |= {variable.display_unit} if variable.display_unit else set()
+            units = displays.setdefault(variable.unit, set())
+            units |= {variable.display_unit} if variable.display_unit else set()
 
     def display(name: str, unit: Unit) -> Attributes:
         other = parse_unit(name)  # value shown = factor * value + offset

@@ -21,7 +21,7 @@ from psa_casadi.units import convert
 ENTRY = "documentation/index.html"
 #: Movement within the time that the model needs to settle, over the nominal size, that is none.
 _AT_REST = 1e-6
-#: What it says of the files of the archive; the first two are always there.
+#: Descriptions of files of the archive; the first two are always there.
 _FILES = {
     "sources/README.txt": "how to compile the sources: one line, no other library",
     LICENSE_ENTRY: "the terms of the model, and the notices of the C code",
@@ -46,11 +46,11 @@ def documentation(
     step: HeldStep | None = None,
     use: str = "",
 ) -> str:
-    """Return a page of its own, without any file beside it: equations, sources, tables.
+    """Return a page that needs no other file: equations, sources, tables.
 
     `places` are those of the files of the archive that it may name; `step` is the communication
-    step that was measured on the reference run.
-    `use` tells how the FMU integrates, where that is not with a solver.
+    step that was measured on the reference run; `use` describes the integration where no solver
+    does it.
     Raises InputError for a character that HTML cannot carry.
     """
     table, s = variable_table(model), model.structure
@@ -61,7 +61,7 @@ def documentation(
     starts |= dict(zip(model.output_names, outputs.tolist(), strict=True))
     interface = {
         title: [
-            (v.name, v.unit, _shown(v.nominal, v, 3), _shown(starts[v.name], v), v.description)
+            (v.name, v.unit, _text(v.nominal, v, 3), _text(starts[v.name], v), v.description)
             for v in table
             if v.kind == kind
         ]
@@ -77,7 +77,7 @@ def documentation(
         published="; ".join(f"{name}: {text}" for name, text in stated),
         use=use,
         period=next((v for v in table if v.name == s.period), None),
-        shown=_shown,
+        quantity=_text,
         step=step,
         steps=STEPS_PER_PERIOD,
         share=SHARE,
@@ -104,7 +104,7 @@ def _components(model: Model) -> list[tuple[str, ...]]:
     return [(c.name, c.description, c.equation_text, c.source) for c in model.components]
 
 
-def _shown(value: float | None, variable: Variable, digits: int = 6) -> str:
+def _text(value: float | None, variable: Variable, digits: int = 6) -> str:
     """Return a value in the unit it is best read in."""
     if value is None:
         return ""
@@ -120,10 +120,10 @@ def _parameters(model: Model, table: Sequence[Variable]) -> dict[str, object]:
     rows = []
     for v in (v for v in table if v.kind == "parameter"):
         result, figure = model.provenance.intervals.get(v.name), figures.get(v.name)
-        interval = f"{_shown(result.low, v)} to {_shown(result.high, v)}" if result else ""
-        low, high = (_shown(b, v) if math.isfinite(b) else "" for b in v.bounds or ())
+        interval = f"{_text(result.low, v)} to {_text(result.high, v)}" if result else ""
+        low, high = (_text(b, v) if math.isfinite(b) else "" for b in v.bounds or ())
         source = ("assumed: " if figure.assumed else "") + figure.source if figure else ""
-        row = (v.name, _shown(v.start, v), interval, f"{low} to {high}", v.description, source)
+        row = (v.name, _text(v.start, v), interval, f"{low} to {high}", v.description, source)
         rows.append(row)
     heads = ("name", "value", "95 % interval", "allowed", "meaning", "source of the value")
     kept = [i for i, _ in enumerate(heads) if i < 2 or any(r[i] for r in rows)]

@@ -1,4 +1,4 @@
-"""What stands behind a model, inside its FMU: a page, meta data, a run to repeat, parameter sets.
+"""The evidence of a model inside its FMU: a page, meta data, a run to repeat, parameter sets.
 
 Sources: SSP Traceability 1.0 (SRMD and its place in an FMU), FMI-LS-REF 1.0.0-beta.1 (roles), SSP
 1.0 (parameter values).
@@ -40,7 +40,7 @@ from psa_casadi.units import FloatArray
 def with_validity(model: Model) -> Model:
     """Return a model with the output `outside_validity`; one that has it is returned as it is.
 
-    Raises InputError for a model that does not say what its records have shown.
+    Raises InputError for a model without the range of its records.
     """
     if OUTPUT in model.output_names:
         return model
@@ -50,13 +50,13 @@ def with_validity(model: Model) -> Model:
             f" output '{OUTPUT}'; give a file that `psa identify` or `psa diagnose` of this version"
             " wrote."
         )
-    observed = model.evidence.seen
+    ranges = model.evidence.seen
     values = {
-        "seen_voltage_low": observed.voltage.low,
-        "seen_voltage_high": observed.voltage.high,
-        "seen_voltage_rate": max(observed.rate, 1e-9),
+        "seen_voltage_low": ranges.voltage.low,
+        "seen_voltage_high": ranges.voltage.high,
+        "seen_voltage_rate": max(ranges.rate, 1e-9),
     }
-    warm = observed.temperature if "temperature" in model.input_names else None
+    warm = ranges.temperature if "temperature" in model.input_names else None
     if warm is not None:
         values |= {"seen_temperature_low": warm.low, "seen_temperature_high": warm.high}
     component = VALIDITY if warm is None else VALIDITY_WITH_TEMPERATURE
@@ -68,12 +68,12 @@ def with_validity(model: Model) -> Model:
 def seen_inputs(model: Model) -> list[tuple[float, float, float]]:
     """Return least, largest value and rate of each input in the records, infinite if not known."""
     rows = []
-    observed = model.evidence.seen if model.evidence else None
-    known = {"voltage": observed.voltage, "temperature": observed.temperature} if observed else {}
+    ranges = model.evidence.seen if model.evidence else None
+    known = {"voltage": ranges.voltage, "temperature": ranges.temperature} if ranges else {}
     for name in model.input_names:
-        result = known.get(name)
-        low, high = (result.low, result.high) if result else (-math.inf, math.inf)
-        rows.append((low, high, observed.rate if observed and name == "voltage" else math.inf))
+        extent = known.get(name)
+        low, high = (extent.low, extent.high) if extent else (-math.inf, math.inf)
+        rows.append((low, high, ranges.rate if ranges and name == "voltage" else math.inf))
     return rows
 
 
@@ -117,9 +117,9 @@ def evidence_files(model: Model, samples: int) -> dict[str, bytes]:
 
 
 def related_files(model: Model, places: Collection[str]) -> dict[str, Related]:
-    """Return what the manifest says of files of evidence at these places."""
+    """Return type, role and meaning of the files of evidence at these places, for the manifest."""
     reference = model.evidence.reference if model.evidence else None
-    run_ = _said(reference) if reference else ""
+    run_ = _words_of(reference) if reference else ""
     table = {}
     for known, (kind, role, meaning) in RELATED.items():
         for place in places:
@@ -146,17 +146,17 @@ def evidence_texts(model: Model, samples: int) -> dict[str, str]:
         if y is not None
     ]
     measured = np.array(valid).reshape(len(valid), 2)
-    stimuli = {"Stimuli": _beside(INPUTS)}
-    files = {"Parameters": _beside(START), **stimuli, "References": _beside(OUTPUTS)}
+    stimuli = {"Stimuli": _local(INPUTS)}
+    files = {"Parameters": _local(START), **stimuli, "References": _local(OUTPUTS)}
     texts |= {
         START: parameter_set(model, name="validation", states=run_start(model)),
         INPUTS: csv_table(("time", *model.input_names), times, inputs),
         MEASURED: csv_table(("time", "displacement"), measured[:, 0], rounded(measured[:, 1:])),
-        VALIDATION: experiments("validation", times, [("record", _said(reference), files)]),
+        VALIDATION: experiments("validation", times, [("record", _words_of(reference), files)]),
     }
     if sets:
         spread = [
-            (_set_name(p), "a parameter set", {"Parameters": _beside(p), **stimuli}) for p in sets
+            (_set_name(p), "a parameter set", {"Parameters": _local(p), **stimuli}) for p in sets
         ]
         texts[UNCERTAINTY] = experiments("uncertainty", times, spread)
     return texts
@@ -169,7 +169,7 @@ def set_files(model: Model, samples: int) -> dict[str, str]:
 
 
 def evidence_page(model: Model, meta: str) -> str:
-    """Return the page on a model's evidence, which says what the meta data say."""
+    """Return the page on a model's evidence, with the content of the meta data."""
     table = {
         part.attrib["type"].removeprefix("psa_casadi."): [
             (e.attrib["keyword"], e.text)
@@ -181,7 +181,7 @@ def evidence_page(model: Model, meta: str) -> str:
     text = filled(
         "evidence.html",
         title=f"{model.name}: evidence",
-        told=table,
+        meta=table,
         validation=VALIDATION,
         sets=SETS,
     )
@@ -234,11 +234,11 @@ def _reference(model: Model) -> tuple[Evidence, ReferenceRun]:
     return evidence, evidence.reference
 
 
-def _said(reference: ReferenceRun) -> str:
+def _words_of(reference: ReferenceRun) -> str:
     return f"the first {reference.time[-1]:.4g} s of the record {reference.record}"
 
 
-def _beside(place: str) -> str:
+def _local(place: str) -> str:
     """Return a place in the archive as a file of the run names it."""
     return place.removeprefix(f"{FOLDER}/")
 

@@ -29,12 +29,12 @@ class Platform:
 
     `name` is FMI 3's platform tuple and its folder; `folder` is the one of FMI 2, which has names
     for x86 alone and takes the tuples of FMI 3 for the others (FMI 2.0.4, section 2.3).
-    Old systems are asked for, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
+    The targets are old systems, so that the binary loads everywhere: GNU libc 2.17 (of 2012) on
     Linux, 2.27 on RISC-V, the first one there, and macOS 11 (of 2020), the first for both
     processors. 32-bit ARM is what Debian's and Ubuntu's armhf run on: ARMv7 with 16 registers for
     doubles, in which they are handed over. 32-bit x86 has SSE2, so that doubles are rounded as
     everywhere else. Windows has the universal C runtime, and a library of an FMU needs nothing
-    beside it but `fmu_src/windows/start.c`. The C library of MinGW-w64, which the compiler would
+    else but `fmu_src/windows/start.c`. The C library of MinGW-w64, which the compiler would
     make at its first use, takes it a minute for each processor.
     """
 
@@ -91,7 +91,7 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
     """Return the platforms named: names of `PLATFORMS`, "host" or "all"; each once, in order.
 
     A platform that is named is one of the table, and its binary loads on old systems; "host" is
-    this machine, and its own compiler will do.
+    this machine, for which its compiler will do.
 
     Raises InputError for a name that is not known, and for platforms that are named where the
     `ziglang` compiler is not installed.
@@ -119,8 +119,8 @@ def compile_library(texts: Mapping[str, str], identifier: str, target: Platform)
     """Compile sources to a shared library that exports only FMI functions; return its bytes.
 
     What the `ziglang` compiler made is kept: its bytes follow from the sources, the flags and its
-    version, so that the same model is compiled once. Without it, this machine's binary is made by
-    its own compiler, which may change unseen, and for its own C library.
+    version, so that the same model is compiled once. Without it, this machine's compiler makes
+    its binary, for its C library; that compiler may change without notice.
 
     Raises MachineError with the compiler's messages if it fails.
     """
@@ -160,7 +160,7 @@ def windows_alone() -> list[str]:
 
 
 def make_compiler_ready() -> None:
-    """Let the `ziglang` compiler make its own parts for this machine's platform.
+    """Let the `ziglang` compiler make its libraries for this machine's platform.
 
     It does so at its first use, in 1 to 4 s; nothing happens where it is not installed.
     """

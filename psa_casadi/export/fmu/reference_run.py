@@ -1,13 +1,13 @@
 """A run inside the FMU to try an importer on: inputs, parameters and the outputs to expect.
 
-The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives alike. On this run
-is measured how short a communication step must be where an importer holds the inputs over it. A
+The files lie in extra/org.fmi-standard.fmi-ls-ref/ of FMI 2 and FMI 3 archives. On this run is
+measured how short a communication step must be where an importer holds the inputs over it. A
 held signal is late by half a step h on average: an output that moves at the rate dy/dt errs by
 h/2 |dy/dt|. So the step for an error of a share e of the range R follows from the signal alone,
 
     h = 2 e R / max |dy/dt|,  for a sine of frequency f over the whole range  h = 2 e / (pi f),
 
-as long as h is short against what the model adds of its own: lags, resonances, the slope of a loop.
+as long as h is short against the dynamics of the model: lags, resonances, the slope of a loop.
 
 Sources: FMI Layered Standard References (FMI-LS-REF) 1.0.0-beta.1 and the Experiments Format of the
 Modelica Association; Astrom and Wittenmark 1997, Computer-Controlled Systems (a hold delays by half
@@ -36,7 +36,8 @@ _NAMES = {"inputs": INPUTS, "outputs": OUTPUTS, "parameters": PARAMETERS}
 #: Relative tolerance that the experiment asks for, and the one the outputs were computed to.
 TOLERANCE = 1e-6
 OWN_TOLERANCE = 1e-12
-_SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
+#: Knots of a test signal: six segments from 0 up to 1.
+SHAPE = (0.0, 0.8, 0.3, 1.0, 0.1, 0.6, 0.6)
 _STEPS_PER_SEGMENT = 100
 _DIGITS = 7
 
@@ -50,29 +51,29 @@ def reference_entries(model: Model, more: Mapping[str, Related]) -> dict[str, by
     """Return the files of the reference run by their place in the archive.
 
     The manifest lists the files `more` too, which it does not make. Raises SimulationError if the
-    model cannot be simulated with its own values.
+    model cannot be simulated with its values.
     """
     times, inputs = reference_inputs(model)
     start = np.array([s.start for s in model.structure.states])
     outputs = rounded(run(model, times, inputs, start, rtol=OWN_TOLERANCE).y)
-    statement = f"straight segments of every input of {model.name}"
+    meaning = f"straight segments of every input of {model.name}"
     files = {"Parameters": PARAMETERS, "Stimuli": INPUTS, "References": OUTPUTS}
     texts = {
         INPUTS: csv_table(("time", *model.input_names), times, inputs),
         OUTPUTS: csv_table(("time", *model.output_names), times, outputs),
         PARAMETERS: parameter_set(model),
-        EXPERIMENTS: experiments("smoke test", times, [("segments", statement, files)]),
+        EXPERIMENTS: experiments("smoke test", times, [("segments", meaning, files)]),
         "fmi-ls-manifest.xml": _manifest(more),
     }
     notes = filled(
-        "fmi-ls-ref.txt", name=model.name, segment=_segment(model), stop=times[-1], step=times[1],
+        "fmi-ls-ref.txt", name=model.name, segment=segment(model), stop=times[-1], step=times[1],
         own=OWN_TOLERANCE, digits=_DIGITS, **_NAMES,
     )  # fmt: skip
     entries = {f"{FOLDER}/{name}": text.encode("utf-8") for name, text in texts.items()}
     return {**entries, NOTES: notes.encode("utf-8")}
 
 
-def _segment(model: Model) -> float:
+def segment(model: Model) -> float:
     """Return the length of a segment [s]: 10 ms, or the multiple of it that lets it settle."""
     return 1e-2 * max(1, math.ceil(time_scale(model) / 1e-2))
 
@@ -82,16 +83,21 @@ def reference_inputs(model: Model) -> tuple[FloatArray, FloatArray]:
 
     A temperature moves by a tenth of its nominal.
     """
-    count = _STEPS_PER_SEGMENT * (len(_SHAPE) - 1)
-    step = _segment(model) / _STEPS_PER_SEGMENT
+    count = _STEPS_PER_SEGMENT * (len(SHAPE) - 1)
+    step = segment(model) / _STEPS_PER_SEGMENT
     times = np.array([round(k * step, 12) for k in range(count + 1)])
     places = np.arange(count + 1) / _STEPS_PER_SEGMENT
     columns = []
     for i, declared in enumerate(model.structure.inputs):
-        shape = np.concatenate([[0.0], np.roll(_SHAPE[1:], 2 * i)])
+        shape = shifted(i)
         size = nominal_value(declared.nominal, model.values) * (0.1 if declared.start else 1.0)
-        columns.append(declared.start + size * np.interp(places, range(len(_SHAPE)), shape))
+        columns.append(declared.start + size * np.interp(places, range(len(SHAPE)), shape))
     return times, rounded(np.array(columns).T.reshape(count + 1, -1))
+
+
+def shifted(place: int) -> FloatArray:
+    """Return the knots of a test signal for the input at a place: `SHAPE`, shifted."""
+    return np.concatenate([SHAPE[:1], np.roll(SHAPE[1:], 2 * place)])
 
 
 def rounded(columns: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.common.variable_table import starts_at_voltage, variable_table
 from psa_casadi.export.fixed_step.code import bounded, function_code, limit_words
-from psa_casadi.export.fixed_step.export import STEPS, FixedStep, shown_output
+from psa_casadi.export.fixed_step.export import STEPS, FixedStep, main_output
 from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import seen_inputs
 from psa_casadi.model.compose import Model, Structure
@@ -203,10 +203,10 @@ def fixed_entry(fixed: FixedStep) -> bytes:
 
 
 def use_of(fixed: FixedStep) -> str:
-    """Return what the page of the FMU says of its steps."""
+    """Return the description of the steps for the page of the FMU."""
     text = filled(
         "fixed_use.txt", plan=fixed.plan, errors=fixed.errors, steps=STEPS,
-        output=shown_output(fixed.plan.model), limit=limit_words(fixed.plan.limit),
+        output=main_output(fixed.plan.model), limit=limit_words(fixed.plan.limit),
     )  # fmt: skip
     return " ".join(text.split())
 
@@ -227,16 +227,16 @@ def exported_texts(
     identifier: str,
     fmi: int = 2,
     fixed: FixedStep | None = None,
-    given: Mapping[str, str] | None = None,
+    kept: Mapping[str, str] | None = None,
 ) -> tuple[str, dict[str, str], str]:
     """Return token, sources by file name, and description of an export.
 
     The token (GUID) is a hash of the description and the sources that were made with an empty one.
-    `fixed` is the step of an FMU with a fixed step, `given` are sources that are taken as they are.
+    `fixed` is the step of an FMU with a fixed step, `kept` are sources that are taken as they are.
     """
 
     def sources(token: str) -> dict[str, str]:
-        return source_files(model, identifier, token, fmi, fixed) | dict(given or {})
+        return source_files(model, identifier, token, fmi, fixed) | dict(kept or {})
 
     bare = sources("")
     names = compiled_files(bare)

@@ -1,4 +1,4 @@
-"""The files of an FMU of either version, unpacked, and what its description says.
+"""The files of an FMU of either version, unpacked, and its description.
 
 FMUs and SSPs come from anywhere: an archive is looked through before anything of it is written.
 """
@@ -43,8 +43,8 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
 
     Where names or sizes are wrong the content is not looked at. Raises nothing for any content.
     """
-    table = {row: Problems() for row in ("archive names", "archive size", "archive intact")}
-    names, size, damage = table.values()
+    problems = {row: Problems() for row in ("archive names", "archive size", "archive intact")}
+    names, size, damage = problems.values()
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()
@@ -56,22 +56,22 @@ def archive_problems(path: Path) -> dict[str, tuple[str, ...]]:
                 damage.add(f"{bad!a} is damaged")
     except _DAMAGE as error:
         damage.add(f"the archive is damaged ({' '.join(ascii(str(error))[1:-1].split())})")
-    return {row: problems.sentences() for row, problems in table.items()}
+    return {row: listed.sentences() for row, listed in problems.items()}
 
 
 def _wrong_names(entries: list[zipfile.ZipInfo]) -> Iterator[str]:
-    """Yield entries that are no plain files at a place of their own inside the folder."""
+    """Yield entries that are no plain files at separate places inside the folder."""
     for entry in entries:
         name, mode = entry.orig_filename, entry.external_attr >> 16
-        displayed = ascii(name[:80])
+        quoted = ascii(name[:80])
         if name.startswith("/") or "\\" in name or ":" in name or ".." in name.split("/"):
-            yield f"{displayed} leads outside the archive's folder"
+            yield f"{quoted} leads outside the archive's folder"
         if not name.isprintable():
-            yield f"{displayed} has control characters"
+            yield f"{quoted} has control characters"
         if stat.S_IFMT(mode) not in (0, stat.S_IFREG, stat.S_IFDIR):
-            yield f"{displayed} is a link or a device"
+            yield f"{quoted} is a link or a device"
         if entry.flag_bits & 0x1:
-            yield f"{displayed} is encrypted"
+            yield f"{quoted} is encrypted"
     same = {(e.filename.removesuffix("/"), e.CRC, e.file_size) for e in entries}  # a repeat is none
     for place, count in Counter(name.casefold() for name, *_ in same).items():
         if count > 1:
@@ -123,6 +123,11 @@ class Element:
     starts: tuple[float, ...]
 
     @property
+    def start(self) -> float:
+        """The start value."""
+        return self.starts[self.place]
+
+    @property
     def real(self) -> bool:
         """Whether it is a floating point number."""
         return self.type in ("Real", "Float64", "Float32")
@@ -135,9 +140,11 @@ class Archive:
 
     `version` is 2 or 3, `description` fmpy's record of the XML. `references`, `nominals` and
     `bounds` map the names of variables to value references, nominal values, and the least and the
-    greatest value, infinite where there is no bound. `elements` are the numbers of all variables:
-    an array `A` has `A[1,1]`, `A[1,2]` and so on; `variables` are fmpy's records. `step_size` is
-    that of the default experiment [s], 1 ms if there is none.
+    greatest value, infinite where there is no bound; the last two those of elements, too.
+    `elements` are the numbers of all variables: an array `A` has `A[1,1]`, `A[1,2]` and so on;
+    `state_elements` are those of the continuous states, in the order of the state vector.
+    `variables` are fmpy's records. `step_size` is that of the default experiment [s], 1 ms if there
+    is none.
 
     Raises InputError if the file is no FMU of FMI 2.0 or FMI 3.0, or must not be unpacked.
     """
@@ -158,7 +165,7 @@ class Archive:
             raise InputError(problem) from error
 
     def _read(self) -> None:
-        """Read what the description says first; raises InputError if it is of no known kind."""
+        """Read the description; raises InputError if it is of no known kind."""
         for text in (self.directory / name for name in _TEXTS):
             if text.is_file() and text.stat().st_size > LONGEST_TEXT:
                 raise InputError(
@@ -166,15 +173,15 @@ class Archive:
                     f" {LONGEST_TEXT >> 20} MiB and is not read; export the FMU again."
                 )
         self.description: Any = fmpy.read_model_description(str(self.directory), validate=False)
-        statement = str(self.description.fmiVersion)
+        version = str(self.description.fmiVersion)
         interface = self.description.coSimulation or self.description.modelExchange
-        if statement[:2] not in ("2.", "3.") or interface is None:
+        if version[:2] not in ("2.", "3.") or interface is None:
             raise InputError(
-                f"{self.path}: is of FMI {statement} and has"
+                f"{self.path}: is of FMI {version} and has"
                 f" {'no' if interface is None else 'an'} interface for model exchange or"
                 " co-simulation; give one of FMI 2.0 or FMI 3.0 that has one of these."
             )
-        self.version = int(statement[0])
+        self.version = int(version[0])
         self._read_flag()
         self.identifier = str(interface.modelIdentifier)
         if not _IDENTIFIER.fullmatch(self.identifier):  # it names the file that is loaded
@@ -192,9 +199,15 @@ class Archive:
             self.bounds[v.name] = (low, math.inf if v.max is None else float(v.max))
         self.variables = {v.name: v for v in self.description.modelVariables}
         self.elements = dict(self._elements())
-        experiment = self.description.defaultExperiment
-        self.step_size = float(getattr(experiment, "stepSize", None) or 1e-3)
+        for name, e in self.elements.items():
+            self.nominals[name] = self.nominals[e.variable]
+            self.bounds[name] = self.bounds[e.variable]
+        self.step_size = self.experiment("stepSize") or 1e-3
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
+        places = {name: k for k, name in enumerate(self._states)}
+        state_elements = [n for n, e in self.elements.items() if e.variable in places]
+        state_elements.sort(key=lambda n: places[self.elements[n].variable])
+        self.state_elements = state_elements
 
     def _read_flag(self) -> None:
         """Note that FMI 3.0 provides directional derivatives: fmpy reads the name of FMI 2.0."""
@@ -211,14 +224,14 @@ class Archive:
             if v.type in _NO_NUMBERS:
                 continue
             shape = [_size(d) for d in v.dimensions]
-            count, statement = math.prod(shape), str(v.start if v.start is not None else "").split()
-            starts = [_number(word) for word in statement] or [0.0]
+            count, words = math.prod(shape), str(v.start if v.start is not None else "").split()
+            starts = [_number(word) for word in words] or [0.0]
             starts = starts if len(starts) == count else starts[:1] * count
             places = product(*(range(1, size + 1) for size in shape))
             for k, place in enumerate(places):
                 name = f"{v.name}[{','.join(map(str, place))}]" if shape else v.name
-                row = v.name, v.type, int(v.valueReference), k, count, tuple(starts)
-                yield str(name), Element(*row)
+                reference = int(v.valueReference)
+                yield str(name), Element(v.name, v.type, reference, k, count, tuple(starts))
 
     def __enter__(self) -> Self:
         return self
@@ -228,8 +241,17 @@ class Archive:
 
     def interfaces(self) -> tuple[int, ...]:
         """Return which of co-simulation (1) and model exchange (0) the description announces."""
-        statement = ((1, self.description.coSimulation), (0, self.description.modelExchange))
-        return tuple(kind for kind, announced in statement if announced is not None)
+        kinds = ((1, self.description.coSimulation), (0, self.description.modelExchange))
+        return tuple(kind for kind, announced in kinds if announced is not None)
+
+    def experiment(self, name: str) -> float:
+        """Return a number of the default experiment by fmpy's name, 0 if there is none."""
+        return float(getattr(self.description.defaultExperiment, name, None) or 0.0)
+
+    @property
+    def internal_step(self) -> float:
+        """The fixed internal step of co-simulation [s], 0 if there is none."""
+        return float(getattr(self.description.coSimulation, "fixedInternalStepSize", None) or 0.0)
 
     @property
     def token(self) -> str:
@@ -269,8 +291,8 @@ class Archive:
 
 def _size(dimension: Any) -> int:
     """Return the size of a dimension: its number, or the start of what sets it."""
-    statement = dimension.start if dimension.variable is None else dimension.variable.start
-    return int(statement or 0)
+    sized = dimension if dimension.variable is None else dimension.variable
+    return int(sized.start or 0)
 
 
 def _number(word: str) -> float:

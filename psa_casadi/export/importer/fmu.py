@@ -1,7 +1,7 @@
 """An FMU with its binary loaded, and instances of it; the classes of fmpy call its functions.
 
-Here is what fmpy lacks: variables by name, errors that hold what the FMU said, statuses as numbers,
-and many instances of a library that is loaded once.
+Here is what fmpy lacks: variables by name, errors with the FMU's messages, statuses as numbers, and
+many instances of a library that is loaded once.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from psa_casadi.units import FloatArray
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 #: As often an FMU may ask for another update of its discrete states.
 _UPDATES = 100
-#: What is told of an FMU that says nothing of a call that fails.
+#: Message of an FMU that logs nothing when a call fails.
 NO_MESSAGE = "no message"
 OK, WARNING, DISCARD, ERROR = 0, 1, 2, 3
 
@@ -111,16 +111,10 @@ class Fmu(Archive):
         """Return an instance; raises FmuError if the FMU refuses, InputError as `loaded`."""
         return Instance(self, interface, **options)
 
-    def start(
-        self, interface: int, *, tolerance: float | None = None,
-        values: Mapping[str, float] | None = None, start_time: float = 0.0,
-        stop_time: float | None = None, **options: Any,
-    ) -> "Instance":  # fmt: skip
-        """Return an instance that is initialised with start values; in step or continuous mode."""
-        instance = self.open(interface, **options)
-        instance.setup(
-            tolerance=tolerance, start_time=start_time, stop_time=stop_time, values=values
-        )
+    def start(self, interface: int, **experiment: Any) -> "Instance":
+        """Return an instance that `setup` has initialised; in step or continuous mode."""
+        instance = self.open(interface)
+        instance.setup(**experiment)
         if interface == MODEL_EXCHANGE:
             instance.require("EnterContinuousTimeMode")
         return instance
@@ -130,7 +124,7 @@ class Fmu(Archive):
 class _Group:
     """Numbers that one call gets or sets: those of variables of a type.
 
-    They are the `rows` among the names that were asked for, and the `places` among the values of
+    They are the `rows` among the wanted names, and the `places` among the values of
     the call; `starts` are all of these.
     """
 
@@ -155,19 +149,16 @@ class Instance:
         self.next_event_time: float | None = None
         self.fmi = copy(fmu.loaded(interface))
         self.fmi._call = self._call
-        two = fmu.version == 2
-        self.derivatives_function = "GetDerivatives" if two else "GetContinuousStateDerivatives"
-        if two:
+        logging: dict[str, Any] = {"logMessage": self._log}
+        if fmu.version == 2:
             memory = fmi2.defaultCallbacks.allocateMemory, fmi2.defaultCallbacks.freeMemory
-            callbacks = fmi2.fmi2CallbackFunctions(fmi2.fmi2CallbackLoggerTYPE(self._log), *memory)
-            options = {"callbacks": callbacks, **options}
-        else:
-            options = {"logMessage": self._log, **options}
+            logger = fmi2.fmi2CallbackLoggerTYPE(self._log)
+            logging = {"callbacks": fmi2.fmi2CallbackFunctions(logger, *memory)}
         try:
-            self.fmi.instantiate(**options)
+            self.fmi.instantiate(**{**logging, **options})
         except Exception as error:  # fmpy's only one
-            statement = self.messages or "no message"
-            raise FmuError(f"the FMU gives no instance: {statement}") from error
+            logged = self.messages or NO_MESSAGE
+            raise FmuError(f"the FMU gives no instance: {logged}") from error
 
     def _log(self, *arguments: Any) -> None:
         self.messages.append((arguments[-1] or b"").decode(errors="replace"))
@@ -177,8 +168,8 @@ class Instance:
         try:
             return type(self.fmi)._call(self.fmi, function, *arguments)
         except fmi1.FMICallException as error:
-            statement = self.messages[-1] if self.messages else NO_MESSAGE
-            text = f"{function} returned status {error.status}: {statement}"
+            logged = self.messages[-1] if self.messages else NO_MESSAGE
+            text = f"{function} returned status {error.status}: {logged}"
             raise FmuError(text, error.status) from None
 
     def __enter__(self) -> Self:
@@ -232,11 +223,11 @@ class Instance:
         return result
 
     def set(self, values: Mapping[str, float]) -> None:
-        """Set variables; elements of arrays that are not given are set to their starts."""
-        inputs = np.array(list(values.values()), dtype=float)
+        """Set variables; elements of arrays without a value here are set to their starts."""
+        numbers = np.array(list(values.values()), dtype=float)
         for g in self.fmu.groups(tuple(values)):
             every = np.array(g.starts)
-            every[g.places] = inputs[g.rows]
+            every[g.places] = numbers[g.rows]
             real = g.type in ("Real", "Float64", "Float32")
             whole = every if real else [int(v) for v in np.rint(every)]
             getattr(self.fmi, f"set{g.type}")(g.references, whole)
@@ -245,16 +236,16 @@ class Instance:
         """Do one communication step."""
         self.fmi.doStep(point, size)
 
-    def set_rates(self, rates: Mapping[str, float], order: int = 1) -> None:
+    def set_rates(self, rates: Mapping[str, float]) -> None:
         """Set the time derivatives of inputs for the next communication step (FMI 2.0 only)."""
         names = self.references(list(rates))
-        self.fmi.setRealInputDerivatives(names, [order] * len(rates), list(rates.values()))
+        self.fmi.setRealInputDerivatives(names, [1] * len(rates), list(rates.values()))
 
-    def output_rates(self, names: Sequence[str], order: int = 1) -> FloatArray:
+    def output_rates(self, names: Sequence[str]) -> FloatArray:
         """Return the time derivatives of outputs at the end of the last communication step."""
         two = self.fmu.version == 2
         read = self.fmi.getRealOutputDerivatives if two else self.fmi.getOutputDerivatives
-        return np.array(read(self.references(names), [order] * len(names)))
+        return np.array(read(self.references(names), [1] * len(names)))
 
     def update_discrete_states(self) -> list[bool]:
         """Update in event mode; return whether to repeat, end, look at nominals, states, time.
@@ -293,7 +284,8 @@ class Instance:
         self.fmi.setTime(float(time))
         self.fmi.setContinuousStates((c_double * len(x))(*x), len(x))
         self.set(inputs)
-        return self.vector(self.derivatives_function, len(x))
+        two = self.fmu.version == 2
+        return self.vector("GetDerivatives" if two else "GetContinuousStateDerivatives", len(x))
 
     def directional(
         self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float] | FloatArray
@@ -308,23 +300,3 @@ class Instance:
         """Return the gradient with respect to knowns of a weighted sum of unknowns (FMI 3.0)."""
         names = self.references(unknowns), self.references(knowns)
         return np.array(self.fmi.getAdjointDerivative(*names, list(seed), len(knowns)))
-
-    def save(self) -> Any:
-        """Return a snapshot of the instance's state; release it with `drop`."""
-        return self.fmi.getFMUState()
-
-    def restore(self, snapshot: Any) -> None:
-        """Set the instance to a snapshot."""
-        self.fmi.setFMUState(snapshot)
-
-    def drop(self, snapshot: Any) -> None:
-        """Release a snapshot."""
-        self.fmi.freeFMUState(snapshot)
-
-    def serialize(self, snapshot: Any) -> bytes:
-        """Return a snapshot as bytes."""
-        return bytes(self.fmi.serializeFMUState(snapshot))
-
-    def deserialize(self, data: bytes) -> Any:
-        """Return the snapshot that bytes hold; release it with `drop`."""
-        return self.fmi.deserializeFMUState(data)

@@ -6,7 +6,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePath
 from typing import Any, Literal
 
 import casadi as ca
@@ -25,6 +26,7 @@ from psa_casadi.export.importer.imported import (
 )
 from psa_casadi.export.importer.played import Played, PlayedEquations
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.model_file import model_of, no_fmu, read_content
 from psa_casadi.units import parse_unit
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
@@ -67,15 +69,18 @@ def read_variables(
     )
     if not whole:
         outputs = {n: v for n, v in outputs.items() if v.type in _REALS}
-    started = _begun(fmu) if whole else set[str]()
-    item = {n for n, v in rows.items() if v.causality == "parameter"} | started
-    fixed = item | {n for n, v in rows.items() if v.causality == "input"}
+    parameter_names = {
+        n
+        for n, v in rows.items()
+        if v.causality == "parameter" or (whole and _has_exact_start(fmu, n))
+    }
+    fixed = parameter_names | {n for n, v in rows.items() if v.causality == "input"}
     for name in [n for n in values if n not in fixed]:
         problems.add(
             f"`values` has '{name}', which is no parameter or input of {fmu.path.name}; it has"
             f" {quoted(sorted(fixed)) or 'none'}."
         )
-    wanted = _free(fmu, free, item, problems)
+    wanted = _free(fmu, free, parameter_names, problems)
     problems.raise_if_any()
     parameters = [
         _parameter(n, fmu, rows[n], arguments, values, problems) for n, arguments in wanted.items()
@@ -83,7 +88,7 @@ def read_variables(
     problems.raise_if_any()
     states = [] if whole else [table[n] for n in fmu.states()]
     taken = [*inputs, *outputs]
-    nominals = {n: fmu.nominals[e.variable] for n, e in fmu.elements.items()}
+    nominals = fmu.nominals
     read = Read(
         selected=Selected(
             states=tuple(v.name for v in states),
@@ -94,13 +99,16 @@ def read_variables(
             fixed=tuple((n, float(v)) for n, v in values.items() if n not in wanted),
         ),
         states=tuple(
-            State(_name(v.name, taken, "_state"), *_said(v, v.name), nominals[v.name])
+            State(_name(v.name, taken, "_state"), *_unit_and_words(v, v.name), nominals[v.name])
             for v in states
         ),
         inputs=tuple(
-            Input(_name(n), *_said(v, n), _start(fmu, n), nominals[n]) for n, v in inputs.items()
+            Input(_name(n), *_unit_and_words(v, n), fmu.elements[n].start, nominals[n])
+            for n, v in inputs.items()
         ),
-        outputs=tuple(Output(plain_name(n), *_said(v, n), nominals[n]) for n, v in outputs.items()),
+        outputs=tuple(
+            Output(plain_name(n), *_unit_and_words(v, n), nominals[n]) for n, v in outputs.items()
+        ),
         parameters=tuple(parameters),
     )
     declared: Iterable[Any] = (*read.states, *read.inputs, *read.outputs, *read.parameters)
@@ -113,20 +121,17 @@ def read_variables(
     return read
 
 
-def _begun(fmu: Fmu) -> set[str]:
-    """Return the variables with a start value of their own that are no parameters."""
-    return {
-        n
-        for n, e in fmu.elements.items()
-        for v in [fmu.variables[e.variable]]
-        if e.real and v.initial == "exact" and v.causality in ("local", "output")
-    }
+def _has_exact_start(fmu: Fmu, name: str) -> bool:
+    """Whether a real variable that is no parameter has a start value that can be set."""
+    variable = fmu.variables[fmu.elements[name].variable]
+    inside = variable.causality in ("local", "output")
+    return fmu.elements[name].real and variable.initial == "exact" and inside
 
 
 def _has_equations(fmu: Fmu) -> bool:
     """Whether an FMU is an ordinary differential equation x' = f(t, x, u, p), but for its times.
 
-    By model exchange of its own binary, in several instances, without event indicators, real
+    By model exchange of its binary, in several instances, without event indicators, real
     numbers in and one at least out.
     """
     exchange = fmu.description.modelExchange
@@ -144,13 +149,12 @@ def _has_equations(fmu: Fmu) -> bool:
 def _free(
     fmu: Fmu, free: Free | None, numbers: Iterable[str], problems: Problems
 ) -> dict[str, tuple[float, float] | Parameter]:
-    """Return the parameters to identify with their bounds: those given, else the FMU's."""
-    item = {n for n in numbers if fmu.elements[n].real}
-    limits = {n: fmu.bounds[fmu.elements[n].variable] for n in item}
-    bounded = {n for n in item if math.isfinite(math.hypot(*limits[n]))}
+    """Return the parameters to identify with their bounds: those of `free`, else the FMU's."""
+    reals = {n for n in numbers if fmu.elements[n].real}
+    bounded = {n for n in reals if math.isfinite(math.hypot(*fmu.bounds[n]))}
     if free is None:
         if not bounded:
-            every = {n: _start(fmu, n) for n in fmu.elements if n in item}
+            every = {n: e.start for n, e in fmu.elements.items() if n in reals}
             listed = ", ".join(f"{n} ({v:g})" for n, v in every.items()) or "none"
             name, v = next(iter(every.items()), ("k", 1.0))
             low, high = sorted((0.1 * v, 10.0 * v)) if v else (-1.0, 1.0)
@@ -159,14 +163,14 @@ def _free(
                 f" identify within which bounds: free={{'{name}': ({low:g}, {high:g})}}, on the"
                 f" command line --free {name}={low:g}:{high:g}."
             )
-        return {n: limits[n] for n in fmu.elements if n in bounded}
-    inputs = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
+        return {n: fmu.bounds[n] for n in fmu.elements if n in bounded}
+    wanted = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free)
     table: dict[str, tuple[float, float] | Parameter] = {}
-    for name, bounds in inputs.items():
-        if name not in item:
+    for name, bounds in wanted.items():
+        if name not in reals:
             problems.add(
                 f"`free` has '{name}', which is no real parameter of {fmu.path.name}; it has"
-                f" {quoted(sorted(item)) or 'none'}."
+                f" {quoted(sorted(reals)) or 'none'}."
             )
         elif bounds is None and name not in bounded:
             problems.add(
@@ -174,7 +178,7 @@ def _free(
                 f" command line --free {name}=LOW:HIGH."
             )
         else:
-            table[name] = limits[name] if bounds is None else bounds
+            table[name] = fmu.bounds[name] if bounds is None else bounds
     return table
 
 
@@ -189,7 +193,7 @@ def _parameter(
     if isinstance(parameter, Parameter):
         return parameter
     low, high = (float(b) for b in parameter)
-    value = float(values.get(name, _start(fmu, name)))
+    value = float(values.get(name, fmu.elements[name].start))
     if low >= high:
         problems.add(f"'{name}' has the bounds [{low:g}, {high:g}]; give the lower one first.")
     elif not low <= value <= high:
@@ -199,7 +203,7 @@ def _parameter(
         )
     log = low > 0 and high >= _DECADE * low
     scale = None if value else 0.1 * (high - low)
-    unit, words = _said(variable, name)
+    unit, words = _unit_and_words(variable, name)
     return Parameter(_name(name), value, unit, (low, high), words, log=log, scale=scale)
 
 
@@ -217,20 +221,15 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
     return plain + "_of_fmu" if plain == "time" else plain
 
 
-def _said(variable: Any, name: str) -> tuple[str, str]:
+def _unit_and_words(variable: Any, name: str) -> tuple[str, str]:
     """Return unit and description; "1" where this package does not know it or it is no SI unit."""
-    statement = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
+    symbol = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
     words = str(variable.description or name)
     try:
-        unit = parse_unit(statement)
+        unit = parse_unit(symbol)
     except InputError:
         return "1", words
-    return statement if unit.ratio == 1 and not unit.offset else "1", words
-
-
-def _start(fmu: Fmu, name: str) -> float:
-    element = fmu.elements[name]
-    return element.starts[element.place]
+    return symbol if unit.ratio == 1 and not unit.offset else "1", words
 
 
 #: Points at which it is looked whether a rate is another state, and nothing else.
@@ -253,16 +252,16 @@ def fmu_model(
     derivatives where it has them, else central differences; those by p are central differences of
     instances initialised with other values. The states start where the FMU starts.
 
-    Any other one is run as a whole, in processes of its own: by model exchange with its events
+    Any other one is run as a whole, in separate processes: by model exchange with its events
     (fmpy's CVode), or by co-simulation where it has no other interface. Its inputs and outputs are
     the ports; derivatives are differences of runs, side by side, 0.1 % of a parameter apart. It
-    begins in its start values at the beginning of each record. Between communication points an
+    starts from its start values at the beginning of each record. Between communication points an
     input is a straight line where the FMU takes input derivatives, else its mean over the step;
     these are the samples, or as many parts of them as it takes until twice as many change no output
     by more than 0.05 % of its standard deviation. Numbers of every type are inputs and outputs,
     elements of arrays too.
 
-    `free` says which parameters are identified: {name: (low, high)}, {name: Parameter}, or names
+    `free` are the parameters that are identified: {name: (low, high)}, {name: Parameter}, or names
     whose least and greatest values the FMU declares; by default all parameters that have both. Of
     one run as a whole, start values of its variables can be named, too. A range of a decade or more
     above 0 is searched on a logarithmic scale. `values` are numbers of parameters in the place of
@@ -290,15 +289,15 @@ def fmu_model(
             return _of_equations(fmu, file, digest, free, values or {}, name)
     chosen = _interface(fmu, None) if chosen is None else chosen
     read = read_variables(fmu, free, values or {}, whole=True)
-    s, item = read.selected, [p.name for p in read.parameters]
+    s, names = read.selected, (p.name for p in read.parameters)
     played = Played(
         str(file.resolve()), digest, chosen, s.inputs, s.outputs,
-        tuple(zip(item, s.parameters, strict=True)), s.fixed,
+        tuple(zip(names, s.parameters, strict=True)), s.fixed,
     )  # fmt: skip
     used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
     foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used, str(file.resolve()))
     equations = PlayedEquations(tuple(o.name for o in read.outputs))
-    return compose([_component(fmu, read, equations, foreign, name, played)], name=_own(fmu, name))
+    return _composed(fmu, read, equations, foreign, name, played)
 
 
 def _interface(fmu: Fmu, wanted: FmuInterface | None) -> int:
@@ -315,18 +314,14 @@ def _no_function() -> tuple[int, int]:
     return 0, 0
 
 
-def _own(fmu: Fmu, name: str | None) -> str:
-    return name or plain_name(str(fmu.description.modelName))
-
-
-def _component(
+def _composed(
     fmu: Fmu, read: Read, equations: Callable[[Symbols], Equations], foreign: Foreign,
     name: str | None, played: Played | None = None,
-) -> Component:  # fmt: skip
-    item = _own(fmu, name)
-    return Component(
-        name=item,
-        description=str(fmu.description.description or f"the FMU '{item}'"),
+) -> Model:  # fmt: skip
+    name = name or plain_name(str(fmu.description.modelName))
+    component = Component(
+        name=name,
+        description=str(fmu.description.description or f"the FMU '{name}'"),
         source=f"{foreign.fmu.file}, sha256 {foreign.fmu.sha256}",
         equations=equations,
         parameters=read.parameters,
@@ -336,17 +331,18 @@ def _component(
         foreign=foreign,
         played=played,
     )
+    return compose([component], name=name)
 
 
 class _TimeEventError(Exception):
-    """An FMU has events at times, which is seen when it is initialised only."""
+    """An FMU has events at times, which only its initialisation shows."""
 
 
 def _of_equations(
     fmu: Fmu, file: Path, digest: str, free: Free | None, values: Mapping[str, float],
     name: str | None,
 ) -> Model:  # fmt: skip
-    """Return the model of an FMU whose equations are asked for."""
+    """Return the model of an FMU whose equations are evaluated."""
     read = read_variables(fmu, free, values)
     imported = imported_of(fmu, digest, read.selected, _sizes(read))
     declared = {n: p.value for n, p in zip(read.selected.parameters, read.parameters, strict=True)}
@@ -358,36 +354,8 @@ def _of_equations(
             raise _TimeEventError from error
         raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
     equations = _FmuEquations(imported, read, _definitions(imported, read))
-    model = compose(
-        [_component(fmu, read, equations, imported.foreign, name)], name=_own(fmu, name)
-    )
+    model = _composed(fmu, read, equations, imported.foreign, name)
     return model.with_starts(dict(zip((s.name for s in read.states), starts, strict=True)))
-
-
-def component_again(
-    file: Path, used: FmuUsed, name: str, parameters: Sequence[Parameter]
-) -> Component:
-    """Return the component of an FMU with these parameters, if the file is that FMU.
-
-    Raises InputError where there is no such file or it has another SHA-256, and as `fmu_model`.
-    """
-    there = file.is_file()
-    if not there or digest_of(file) != used.sha256:
-        why = "is another FMU than the one it was saved with" if there else "is not there"
-        raise InputError(
-            f"the model has the FMU '{used.file}' (sha256 {used.sha256}), and {file} {why}; put"
-            " that FMU there, or type psa.load_model(MODEL, fmu=FMU) with the place where it is."
-        )
-    if len(parameters) != len(used.parameters):
-        raise InputError(
-            f"the FMU '{used.file}' has {len(used.parameters)} parameters named and"
-            f" {len(parameters)} declared; declare each."
-        )
-    free = dict(zip(used.parameters, parameters, strict=True))
-    chosen = fmu_model(
-        file, free=free, values=used.values, name=name, interface=used.interface or None
-    )
-    return chosen.components[0]
 
 
 def _sizes(read: Read) -> tuple[float, ...]:
@@ -443,3 +411,51 @@ def _definitions(imported: Imported, read: Read) -> dict[int, int]:
         k: next((j for j in range(count) if all(w[k] == v[j] for v, w in items)), -1) for k in rows
     }
     return {k: j for k, j in table.items() if j >= 0}
+
+
+def load_model(
+    path: str | os.PathLike[str],
+    effects: Iterable[Component] = (),
+    *,
+    fmu: str | os.PathLike[str] | None = None,
+) -> Model:
+    """Read MODEL.json; `effects` are the user's effects that it may have.
+
+    Equations in the file are read as text, none of it is run. The binary of an FMU that the model
+    has runs in this process: `fmu` is that FMU or the folder with it, by default the folder of
+    MODEL.json.
+
+    Raises InputError with every unknown name, missing or bad value, and for an FMU that is not
+    there or has another SHA-256 than when the model was saved.
+    """
+    place = Path(path).parent if fmu is None else Path(fmu)
+    return model_of(read_content(path), str(path), effects, partial(_component_at, place))
+
+
+def _component_at(
+    place: Path, used: FmuUsed, name: str, parameters: tuple[Parameter, ...]
+) -> Component:
+    """Return the component of an FMU that lies at a place, or in it, with these parameters.
+
+    Raises InputError where there is no such file or it has another SHA-256, and as `fmu_model`.
+    """
+    if PurePath(used.file).name != used.file:
+        return no_fmu(used, name, parameters)
+    file = place / used.file if place.is_dir() else place
+    there = file.is_file()
+    if not there or digest_of(file) != used.sha256:
+        why = "is another FMU than the one it was saved with" if there else "is not there"
+        raise InputError(
+            f"the model has the FMU '{used.file}' (sha256 {used.sha256}), and {file} {why}; put"
+            " that FMU there, or type psa.load_model(MODEL, fmu=FMU) with the place where it is."
+        )
+    if len(parameters) != len(used.parameters):
+        raise InputError(
+            f"the FMU '{used.file}' has {len(used.parameters)} parameters named and"
+            f" {len(parameters)} declared; declare each."
+        )
+    free = dict(zip(used.parameters, parameters, strict=True))
+    chosen = fmu_model(
+        file, free=free, values=used.values, name=name, interface=used.interface or None
+    )
+    return chosen.components[0]

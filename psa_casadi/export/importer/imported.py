@@ -2,7 +2,7 @@
 
     w = (x', y) = F(t, v, p),  v = (x, u)
 
-and its derivative along a change of v and p. By v it is the FMU's own directional derivative where
+and its derivative along a change of v and p. By v it is the FMU's directional derivative where
 it has one, else a central difference; by p, whose values an FMU takes before its initialization
 only, a central difference of instances that were initialised with other values.
 """
@@ -26,7 +26,7 @@ from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError, Instan
 from psa_casadi.simulation.compiler import shared_library
 
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
-#: What is said of an FMU with events at times.
+#: The message for an FMU with events at times.
 TIME_EVENT = "the FMU announces an event at a time of its own"
 #: Functions of `psa_imported` by version: name of a field, name in the standard.
 _BOTH = {"set_time": "SetTime", "set_states": "SetContinuousStates"}
@@ -37,7 +37,7 @@ _FUNCTIONS = {
 }  # fmt: skip
 
 
-class _Given(ctypes.Structure):
+class _ImportedFmu(ctypes.Structure):
     """Mirror of `psa_imported` in imported.h."""
 
     _fields_ = (
@@ -78,7 +78,7 @@ class Imported:
     selected: Selected
     sizes: Sequence[float]
     instances: dict[tuple[int, int], Instance] = field(default_factory=dict)
-    #: What the FMU said when it could not be initialised.
+    #: The FMU's message when it could not be initialised.
     refused: str = ""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -97,7 +97,7 @@ class Imported:
 
     @cached_property
     def library(self) -> ctypes.CDLL:
-        """The compiled functions, loaded, and given what they need of the FMU."""
+        """The compiled functions, loaded, with pointers to functions and variables of the FMU."""
         s, of, fmu, version = self.selected, self.fmu.references, self.fmu, self.fmu.version
         known = {"inputs": s.inputs, "shown": (*s.rates, *s.outputs),
                  "known": (*s.states, *s.inputs)}  # fmt: skip
@@ -113,7 +113,7 @@ class Imported:
         prepare = _PREPARE(self._prepared)
         self._kept = arrays, prepare  # C points to these
         library = ctypes.CDLL(self.path)
-        library.psa_import(ctypes.byref(_Given(version=version, prepare=prepare, **pointers)))
+        library.psa_import(ctypes.byref(_ImportedFmu(version=version, prepare=prepare, **pointers)))
         return library
 
     @property

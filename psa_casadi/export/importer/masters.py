@@ -1,18 +1,46 @@
 """Two small importers of one FMU: stepping it (co-simulation), integrating it (model exchange)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import scipy
 
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
-from psa_casadi.export.importer.signals import Signals
 from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
 from psa_casadi.units import FloatArray
+
+
+@dataclass(frozen=True)
+class Signals:
+    """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`.
+
+    With `held` they keep the value of a knot up to the next one, where they jump.
+    """
+
+    names: tuple[str, ...]
+    times: FloatArray
+    values: FloatArray
+    held: bool = False
+
+    def at(self, times: FloatArray | float, *, before: bool = False) -> FloatArray:
+        """Return the inputs at times (n,), shape (n, nu); at a jump those after it, or `before`."""
+        wanted = np.atleast_1d(np.asarray(times, dtype=float))
+        if self.held:
+            side: Literal["left", "right"] = "left" if before else "right"
+            rows = np.searchsorted(self.times, wanted, side) - 1
+            return self.values[np.maximum(rows, 0)]
+        columns = [np.interp(wanted, self.times, column) for column in self.values.T]
+        return np.array(columns).reshape(len(self.names), len(wanted)).T
+
+    def on(self, times: FloatArray) -> "Signals":
+        """Return the signals sampled at times: what an importer that samples them passes on."""
+        return Signals(self.names, times, self.at(times), self.held)
 
 
 def communicate(
@@ -21,14 +49,13 @@ def communicate(
     inputs: Signals,
     outputs: Sequence[str],
     *,
-    rates: bool = True,
     settled: bool = False,
 ) -> FloatArray:
     """Step an initialised instance over communication points (n,); return outputs (n, ny).
 
-    Inputs are set at the start of each step; with `rates` their slope over the step is set too
-    unless they are held, or FMI 3.0 has no way to. Outputs are read at the end of each step, and at
-    the start; with `settled` after the inputs of that time are set, which counts where these jump.
+    Inputs are set at the start of each step; their slope over the step is set too unless they are
+    held, or FMI 3.0 has no way to. Outputs are read at the end of each step, and at the start; with
+    `settled` after the inputs of that time are set, which counts where these jump.
     """
     samples = inputs.at(times)
     names = inputs.names
@@ -38,7 +65,7 @@ def communicate(
     for k, (begin, end) in enumerate(pairwise(times)):
         size = float(end - begin)
         instance.set(dict(zip(names, samples[k], strict=True)))
-        if rates and instance.fmu.version == 2 and not inputs.held:
+        if instance.fmu.version == 2 and not inputs.held:
             slope = (samples[k + 1] - samples[k]) / size
             instance.set_rates(dict(zip(names, slope, strict=True)))
         instance.step(float(begin), size)
@@ -50,13 +77,12 @@ def communicate(
 
 def co_simulate(
     fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
-    tolerance: float | None = None, rates: bool = True, values: dict[str, float] | None = None,
-    settled: bool = False,
+    tolerance: float | None = None, values: dict[str, float] | None = None, settled: bool = False,
 ) -> FloatArray:  # fmt: skip
     """Run a new co-simulation instance over communication points; return outputs (n, ny)."""
     start = float(times[0])
     with fmu.start(CO_SIMULATION, tolerance=tolerance, values=values, start_time=start) as instance:
-        return communicate(instance, times, inputs, outputs, rates=rates, settled=settled)
+        return communicate(instance, times, inputs, outputs, settled=settled)
 
 
 def integrate(

@@ -10,21 +10,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from fmpy.sundials import CVodeSolver
 
-from psa_casadi.export.importer.fmu import (
-    CO_SIMULATION,
-    MODEL_EXCHANGE,
-    NO_MESSAGE,
-    Fmu,
-    FmuError,
-    Instance,
-)
+from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, NO_MESSAGE, Fmu, FmuError
 from psa_casadi.export.importer.imported import opened
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals
 from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
@@ -40,7 +34,7 @@ class Run:
     """What an FMU is to do: values before its initialization, inputs u (n, nu) at times t (n,).
 
     `interface` is `CO_SIMULATION` or `MODEL_EXCHANGE`; between samples inputs are straight lines,
-    or held (`hold` "zero"). A step of co-simulation is divided into so many `parts`.
+    or held (`hold` "zero"). A step of co-simulation is divided into `parts`.
     """
 
     file: str
@@ -62,7 +56,7 @@ def play(run: Run) -> FloatArray | str:
     except Exception as error:  # noqa: BLE001 - of an FMU and of fmpy, any
         if NO_MESSAGE not in str(error):
             return str(error) or type(error).__name__
-    try:  # once more: some say why only where they are asked to
+    try:  # once more: some give the reason only with logging
         return _played(run, loggingOn=True)
     except Exception as error:  # noqa: BLE001
         return str(error)
@@ -84,43 +78,37 @@ def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     during = at[:-1] if rates and lines else middle
     table = {**run.values, **dict(zip(names, at[0].tolist(), strict=True))}
     result = np.empty((len(points), len(run.outputs)))
-    first = float(points[0])
-    with fmu.start(CO_SIMULATION, values=table, start_time=first, **options) as instance:
+    with fmu.open(CO_SIMULATION, **options) as instance:
+        instance.setup(values=table, start_time=float(points[0]))
         result[0] = instance.get(run.outputs)
         for k, (begin, end) in enumerate(pairwise(points.tolist())):
             instance.set(dict(zip(names, during[k].tolist(), strict=True)))
             if rates and lines and names:
                 slopes = (at[k + 1] - at[k]) / (end - begin)
                 instance.set_rates(dict(zip(names, slopes.tolist(), strict=True)))
-            _step(instance, begin, end - begin)
+            done = instance.fmi.doStep(begin, end - begin)
+            if done is not None and done[1]:
+                raise FmuError(f"the FMU ends the simulation at {end:g} s")
             instance.set(dict(zip(names, at[k + 1].tolist(), strict=True)))
             result[k + 1] = instance.get(run.outputs)
     columns = [np.interp(run.t, points, column) for column in result.T]
     return np.array(columns).reshape(len(run.outputs), len(run.t)).T
 
 
-def _step(instance: Instance, begin: float, size: float) -> None:
-    statement = instance.fmi.doStep(begin, size)
-    if statement is not None and bool(statement[1]):
-        raise FmuError(f"the FMU ends the simulation at {begin + size:g} s")
-
-
 def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
     """Return the communication points of a run over times t (n,).
 
-    They are the times, more where the FMU's default step is shorter, and so many `parts` of each
+    They are the times, more where the FMU's default step is shorter, and `parts` points in each
     step; multiples of its internal step, or of one interval, where the FMU takes no other ones.
     """
     co, gaps = fmu.description.coSimulation, np.diff(t)
     if not len(gaps):
         return t
-    statement = getattr(fmu.description.defaultExperiment, "stepSize", None)
-    most = float(statement) if statement else math.inf
-    most = min(most, float(np.max(gaps))) / parts
-    internal, middle = getattr(co, "fixedInternalStepSize", None), float(np.median(gaps))
+    most = min(fmu.experiment("stepSize") or math.inf, float(np.max(gaps))) / parts
+    internal, middle = fmu.internal_step, float(np.median(gaps))
     even = bool(np.ptp(gaps) <= _SAME * middle)
     if internal:
-        size = float(internal) * max(1, math.floor(middle / parts / float(internal) * (1 + _SAME)))
+        size = internal * max(1, math.floor(middle / parts / internal * (1 + _SAME)))
     elif co.canHandleVariableCommunicationStepSize:
         counts = np.ceil(gaps / most * (1 - _SAME)).astype(int).clip(1)
         inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(t, t[1:], counts)]  # noqa: B905
@@ -148,20 +136,6 @@ class _Solver(CVodeSolver):  # type: ignore[misc]
         return int(super().f(t, y, ydot, data))
 
 
-@dataclass(frozen=True, eq=False)
-class _Inputs:
-    """The inputs of a run, set in an instance at a time; held ones only at events."""
-
-    instance: Instance
-    run: Run
-
-    def apply(self, t: float, *, event: bool = False) -> None:
-        """Set the inputs of a time."""
-        if self.run.inputs and (event or self.run.hold != "zero"):
-            values = _inputs(self.run, np.array([t]))[0].tolist()
-            self.instance.set(dict(zip(self.run.inputs, values, strict=True)))
-
-
 def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
     """Integrate a new instance of model exchange over a run, with its events. Raises FmuError."""
     t = run.t.tolist()
@@ -172,14 +146,20 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
         two, output = fmu.version == 2, fmu.description.modelExchange
         finished = getattr(output, "completedIntegratorStepNotNeeded", None)
         needed = bool(output.needsCompletedIntegratorStep) and not finished
-        inputs = _Inputs(instance, run)
+
+        def apply(t: float, *, event: bool = False) -> None:
+            """Set the inputs of a time; held ones only at events."""
+            if run.inputs and (event or run.hold != "zero"):
+                values = _inputs(run, np.array([t]))[0].tolist()
+                instance.set(dict(zip(run.inputs, values, strict=True)))
+
         solver = _Solver(
-            nx=sum(fmu.elements[n].variable in set(fmu.states()) for n in fmu.elements),
-            nz=fmu.indicator_count(), get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
+            nx=len(fmu.state_elements), nz=fmu.indicator_count(),
+            get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
             get_dx=fmi.getDerivatives if two else fmi.getContinuousStateDerivatives,
             get_z=fmi.getEventIndicators, get_nominals=fmi.getNominalsOfContinuousStates,
-            set_time=fmi.setTime, input=inputs, startTime=t[0], maxStep=(t[-1] - t[0]) / 50.0,
-            relativeTolerance=_TOLERANCE, maxNumSteps=_MOST_STEPS,
+            set_time=fmi.setTime, input=SimpleNamespace(apply=apply), startTime=t[0],
+            maxStep=(t[-1] - t[0]) / 50.0, relativeTolerance=_TOLERANCE, maxNumSteps=_MOST_STEPS,
         )  # fmt: skip
         rows = [instance.get(run.outputs)]
         now, same = t[0], 1e-12 * (t[-1] - t[0])
@@ -188,18 +168,16 @@ def _integrated(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
                 stop = min(target, event)
                 happened, _, now = solver.step(now, stop)
                 fmi.setTime(now)
-                inputs.apply(now)
-                requested = (
-                    [bool(q) for q in fmi.completedIntegratorStep()] if needed else [False] * 2
-                )
-                if requested[1]:
+                apply(now)
+                wants_event, ends = fmi.completedIntegratorStep() if needed else (False, False)
+                if ends:
                     raise FmuError(f"the FMU ends the simulation at {now:g} s")
                 jumps = run.hold == "zero" and now >= target - same
-                if happened or requested[0] or jumps or now >= event - same:
+                if happened or wants_event or jumps or now >= event - same:
                     if jumps:
                         rows.append(instance.get(run.outputs))
                     instance.require("EnterEventMode")
-                    inputs.apply(now, event=True)
+                    apply(now, event=True)
                     event = instance.leave_event_mode()
                     solver.reset(now)
             if len(rows) < 1 + t.index(target):

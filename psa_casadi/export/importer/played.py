@@ -40,19 +40,20 @@ from psa_casadi.variables import Input, Output
 #: Step of a difference over the usual size of a parameter: far above what a solver with a tolerance
 #: of 1e-6 errs by, and small enough for a slope that is right to a thousandth.
 _STEP = 1e-3
-#: A slope jumps at a sample where it is so many times those beside, and this share of the largest:
-#: an output that is discontinuous at an event has another value there. Then the lesser of the
-#: differences to either side is its slope.
+#: A slope jumps at a sample where it is this many times its neighbours, and this share of the
+#: largest: an output that is discontinuous at an event has another value there. Then the lesser of
+#: the differences to either side is its slope.
 _SPIKE, _SPIKE_SHARE = 5.0, 0.05
 #: A step is divided until twice as many parts change an output by less than this share of its
-#: standard deviation, a twentieth of a noise of 1 %; into so many parts at most.
+#: standard deviation, a twentieth of a noise of 1 %; into this many parts at most.
 _SETTLED, _MOST_PARTS = 5e-4, 32
 #: Parts of a step by FMU and record.
 _PARTS: dict[str, int] = {}
 #: Runs that are kept, and how long [s] until it is looked whether the work is to end.
 _KEPT, _LOOK = 512, 0.1
-#: What a model has in the place of an FMU: outputs that are played to it, inputs that it gives.
-_PLAYED, _GIVEN = "played_", "given_"
+#: Prefixes of names in a model without its FMU: the FMU's outputs, which are played to it as
+#: inputs, and the FMU's inputs, which are its outputs.
+PLAYED, GIVEN = "played_", "given_"
 
 
 @dataclass(frozen=True)
@@ -76,17 +77,17 @@ class Played:
     ) -> list[FloatArray]:  # fmt: skip
         """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
 
-        A step of co-simulation is divided into so many `parts`. Raises SimulationError with what
-        the FMU said.
+        A step of co-simulation is divided into so many `parts`. Raises SimulationError with the
+        FMU's message.
         """
         return RUNS.of([self._of(values, u, t, hold, parts) for values, u in wanted])
 
     def _of(
         self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str, parts: int
     ) -> Run:
-        table = {**dict(self.fixed), **{n: values[item] for item, n in self.parameters}}
-        item = self.file, self.digest, self.interface, self.inputs, self.outputs
-        return Run(*item, table, t, u, hold, parts)
+        starts = {**dict(self.fixed), **{n: values[name] for name, n in self.parameters}}
+        fmu = self.file, self.digest, self.interface, self.inputs, self.outputs
+        return Run(*fmu, starts, t, u, hold, parts)
 
     def _parts(self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str) -> int:
         """Return into how many parts a step of co-simulation is divided with these inputs.
@@ -119,12 +120,12 @@ class Played:
         States are those of effects. They begin as far from rest as `x0` is from the rest that
         `start_for` finds without the FMU, whatever `s0` is.
         """
-        item = dict(values or model.values)
-        inner = inner_of(model).with_values(item)
-        items = list(model.output_names if outputs is None else outputs)
+        at = dict(values or model.values)
+        inner = inner_of(model).with_values(at)
+        wanted = list(model.output_names if outputs is None else outputs)
         away, names = x0 - start_for(model, t, u, {}).x, inner.output_names
         states = dict(zip(model.state_names, away.tolist(), strict=True))
-        count, inputs = len(unknowns), [_GIVEN + n for n in model.input_names]
+        count, inputs = len(unknowns), [GIVEN + n for n in model.input_names]
 
         def around(y: FloatArray, texts: Sequence[str], by: Sequence[str | int]) -> Steps:
             """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
@@ -151,23 +152,23 @@ class Played:
             for k, q in enumerate(unknowns)
             if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
         ]
-        steps = {k: _step(inner, unknowns[k], item) for k in moved}
+        steps = {k: _step(inner, unknowns[k], at) for k in moved}
 
         def changed(k: int, side: int) -> tuple[Mapping[str, float], FloatArray]:
             """Return values and inputs with a step of an unknown to one side."""
             q, h = unknowns[k], side * steps[k]
-            new = {**item, q: item[q] + h} if isinstance(q, str) else item
+            new = {**at, q: at[q] + h} if isinstance(q, str) else at
             return new, applied + h * before.sensitivity[:, :, k]
 
-        parts = self._parts(item, u, t, kept)
+        parts = self._parts(at, u, t, kept)
         plain, *others = self.outputs_of(
-            [(item, applied), *(changed(k, 1) for k in moved)], t, kept, parts
+            [(at, applied), *(changed(k, 1) for k in moved)], t, kept, parts
         )
-        result = around(plain, items, unknowns)
-        rows = [names.index(n) for n in items]
+        result = around(plain, wanted, unknowns)
+        rows = [names.index(n) for n in wanted]
 
         def slope(k: int, side: int, y: FloatArray) -> FloatArray:
-            return (around(y, items, ()).y[:, rows] - result.y[:, rows]) / (side * steps[k])
+            return (around(y, wanted, ()).y[:, rows] - result.y[:, rows]) / (side * steps[k])
 
         slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
         jumping = [k for k in moved if _jumps(slopes[k])]
@@ -184,7 +185,7 @@ class Played:
 
 
 def _jumps(slope: FloatArray) -> bool:
-    """Whether a difference (n, m) leads across jumps: samples that stand far above those beside."""
+    """Whether a difference (n, m) leads across jumps: samples far above their neighbours."""
     size = np.abs(slope)
     others = np.maximum(size[:-2], size[2:])
     least = _SPIKE_SHARE * np.max(size, axis=0, initial=0.0)
@@ -225,8 +226,8 @@ class _InnerEquations:
     outputs: tuple[str, ...]
 
     def __call__(self, s: Symbols) -> Equations:
-        expressions: dict[str, Expression] = {_GIVEN + n: getattr(s, n) for n in self.inputs}
-        table = {n: getattr(s, _PLAYED + n) for n in self.outputs}
+        expressions: dict[str, Expression] = {GIVEN + n: getattr(s, n) for n in self.inputs}
+        table = {n: getattr(s, PLAYED + n) for n in self.outputs}
         return Equations(out={**table, **expressions})
 
 
@@ -252,8 +253,8 @@ def _inner(component: Component) -> Component:
     plain = replace(
         opened.component if opened else component,
         equations=_InnerEquations(tuple(i.name for i in inputs), tuple(o.name for o in outputs)),
-        inputs=(*inputs, *(Input(_PLAYED + o.name, o.unit, o.description) for o in outputs)),
-        outputs=(*outputs, *(Output(_GIVEN + i.name, i.unit, i.description) for i in inputs)),
+        inputs=(*inputs, *(Input(PLAYED + o.name, o.unit, o.description) for o in outputs)),
+        outputs=(*outputs, *(Output(GIVEN + i.name, i.unit, i.description) for i in inputs)),
         foreign=None,
         played=None,
     )
@@ -263,24 +264,24 @@ def _inner(component: Component) -> Component:
 @cache
 @in_turn
 def _loops(structure: Structure) -> bool:
-    """Whether what is given to an FMU depends on what is played of it, states in between or not."""
+    """Whether inputs of an FMU depend on its outputs, directly or through states."""
     reach = closure(dependence(structure.xdot, structure.x))
     played = ca.vertcat(
         ca.SX(0, 1),
-        *(structure.symbols[i.name] for i in structure.inputs if i.name.startswith(_PLAYED)),
+        *(structure.symbols[i.name] for i in structure.inputs if i.name.startswith(PLAYED)),
     )
     hit = [k for k, rate in enumerate(ca.vertsplit(structure.xdot)) if ca.depends_on(rate, played)]
     behind = [k for k in range(structure.x.numel()) if any(k == j or reach[k, j] for j in hit)]
     reached = ca.vertcat(played, structure.x[behind])
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
     return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
 
 
 @cache
 @in_turn
 def _filtered(structure: Structure) -> bool:
-    """Whether what is given to an FMU has a memory, so that held inputs are not held there."""
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(_GIVEN)]
+    """Whether inputs of an FMU depend on states, so that held inputs are not held there."""
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
     return bool(rows and structure.x.numel() and ca.depends_on(structure.y[rows], structure.x))
 
 
@@ -298,14 +299,14 @@ class _Runs:
 
     def of(self, runs: Iterable[Run]) -> list[FloatArray]:
         """Return the outputs of runs. Raises SimulationError."""
-        items = list(runs)
-        keys = {_key(r): r for r in items}
+        wanted = [(_key(r), r) for r in runs]
+        by_key = dict(wanted)
         with self._lock:
-            new = {k: self._submitted(r) for k, r in keys.items() if k not in self._kept}
-            table: dict[str, FloatArray | str] = {k: self._kept[k] for k in keys if k not in new}
+            new = {k: self._submitted(r) for k, r in by_key.items() if k not in self._kept}
+            table: dict[str, FloatArray | str] = {k: self._kept[k] for k in by_key if k not in new}
         try:
             for key, future in new.items():
-                table[key] = self._result(future, keys[key])
+                table[key] = self._result(future, by_key[key])
         except KeyboardInterrupt:
             self.end()
             raise
@@ -314,11 +315,13 @@ class _Runs:
                 self._kept[key] = table[key]
             while len(self._kept) > _KEPT:
                 self._kept.popitem(last=False)
-        results = [table[_key(r)] for r in items]
-        for result in results:
+        outputs = []
+        for key, _ in wanted:
+            result = table[key]
             if isinstance(result, str):
                 raise SimulationError(f"The FMU could not be simulated: {result}")
-        return [r for r in results if not isinstance(r, str)]
+            outputs.append(result)
+        return outputs
 
     def _submitted(self, wanted: Run) -> "Future[Any]":
         self.count, self.samples = self.count + 1, self.samples + len(wanted.t)
@@ -361,14 +364,9 @@ def _waited(future: "Future[Any]") -> FloatArray | str:
         raise_if_stopped()
 
 
-def _key(of: Run) -> str:
-    output = repr(
-        (of.file, of.digest, of.interface, of.inputs, of.outputs, of.values, of.hold, of.parts)
-    )
-    content = hashlib.sha256(output.encode())
-    content.update(np.ascontiguousarray(of.t).tobytes())
-    content.update(np.ascontiguousarray(of.u).tobytes())
-    return content.hexdigest()
+def _key(r: Run) -> str:
+    what = (r.file, r.digest, r.interface, r.inputs, r.outputs, r.values, r.hold, r.parts)
+    return hashlib.sha256(repr(what).encode() + r.t.tobytes() + r.u.tobytes()).hexdigest()
 
 
 RUNS = _Runs()

@@ -1,17 +1,19 @@
-"""What was identified of an FMU as its start values: a parameter set, or the FMU with these."""
+"""The identified parameters of an FMU as start values: a parameter set, or the FMU with these."""
 
 import io
 import os
 import zipfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from psa_casadi.component import Component
+from psa_casadi.component import Component, Foreign
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.export.common.parameter_sets import parameter_rows, set_text
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.imported import digest_of, opened
 from psa_casadi.files import atomic_path, atomic_write
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -21,64 +23,79 @@ _DESCRIPTION = "modelDescription.xml"
 _SAME = 1e-6
 
 
+@dataclass(frozen=True, eq=False)
+class FmuPart:
+    """A model that is of an FMU, its component, and what that declares of the FMU."""
+
+    model: Model
+    component: Component
+    foreign: Foreign
+
+    @property
+    def fmu(self) -> Fmu:
+        """The FMU as it is in its file now, unpacked once in a process."""
+        file = Path(self.foreign.place)
+        return opened(file, digest_of(file))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The values of the FMU's parameters by the names that these have in it."""
+        names = self.foreign.fmu.parameters
+        declared = zip(names, self.component.parameters, strict=True)
+        return {n: self.model.values[p.name] for n, p in declared}
+
+    @property
+    def starts(self) -> dict[str, float]:
+        """The values that are set in the FMU before its initialization, by the names in it."""
+        return {**self.foreign.fmu.values, **self.values}
+
+
+def fmu_part(model: Model, cure: str) -> FmuPart:
+    """Return the part of a model that is an FMU; raises InputError, with a cure, if none is."""
+    for component in model.components:
+        if component.foreign:
+            return FmuPart(model, component, component.foreign)
+    raise InputError(f"The model '{model.name}' is of no FMU; {cure}.")
+
+
 def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note, ...]:
     """Write the parameters of an FMU's model as start values, and return what is to be noted.
 
     To NAME.ssv a parameter set of SSP 1.0, in the FMU's names; to NAME.fmu the FMU with these
-    starts in its description. Its binary stays as it is: where that has starts of its own, an
-    importer must set those of the description, which the note says.
+    starts in its description. Its binary stays as it is: if that starts from other values, an
+    importer must set those of the description, and a note is returned.
 
     Raises InputError for a model that is of no FMU, and for another ending.
     """
-    target, item = Path(path), [c for c in model.components if c.foreign]
-    if not item:
-        raise InputError(f"The model '{model.name}' is of no FMU; save it with psa.save_model.")
-    component = item[0]
-    values = fmu_values(model, component)
+    target, part = Path(path), fmu_part(model, "save it with psa.save_model")
     if target.suffix.lower() == ".ssv":
-        atomic_write(target, start_set(model, component))
+        atomic_write(target, start_set(part))
         return ()
     if target.suffix.lower() != ".fmu":
         raise InputError(f"{target}: start values are written to NAME.fmu or NAME.ssv; name it so.")
-    place = Path(component.foreign.place) if component.foreign else target
     with atomic_path(target) as temporary:
-        _copy(place, temporary, values)
-    return _kept_by(target, values)
+        _copy(part.fmu, temporary, part.values)
+    return _notes_on_binary(target, part.values)
 
 
-def start_set(model: Model, component: Component) -> str:
-    """Return the parameters of an FMU as a parameter set (SSV), in the names that it has.
+def start_set(part: FmuPart) -> str:
+    """Return the parameters of an FMU, and what else is set in it, as a parameter set (SSV).
 
-    And what else was set in it.
+    The names are the FMU's.
     """
-    item = (p.name for p in component.parameters)
-    known = dict(zip(item, fmu_values(model, component), strict=True))
-    rows = parameter_rows(model)
+    known = {p.name: n for p, n in zip(part.component.parameters, part.values, strict=True)}
+    rows = parameter_rows(part.model)
     items = [(known[n], m, v, "" if u == "1" else u) for n, m, v, u in rows if n in known]
-    fixed = component.foreign.fmu.values if component.foreign else {}
-    items += [(n, "as it was set", v, "") for n, v in fixed.items()]
-    with Archive(Path(component.foreign.place if component.foreign else "")) as archive:
-        kinds = {n: archive.elements[n].type for n, *_ in items if not archive.elements[n].real}
-    return set_text(component.name, items, kinds)
+    items += [(n, "as it was set", v, "") for n, v in part.foreign.fmu.values.items()]
+    elements = part.fmu.elements
+    kinds = {n: elements[n].type for n, *_ in items if not elements[n].real}
+    return set_text(part.component.name, items, kinds)
 
 
-def fmu_values(model: Model, component: Component) -> dict[str, float]:
-    """Return the values of an FMU's parameters by the names that these have in it."""
-    names = component.foreign.fmu.parameters if component.foreign else ()
-    return {n: model.values[p.name] for n, p in zip(names, component.parameters, strict=True)}
-
-
-def fmu_starts(model: Model, component: Component) -> dict[str, float]:
-    """Return what is set in an FMU before its initialization, by the names in it."""
-    fixed = component.foreign.fmu.values if component.foreign else {}
-    return {**fixed, **fmu_values(model, component)}
-
-
-def _copy(place: Path, target: Path, values: Mapping[str, float]) -> None:
+def _copy(fmu: Archive, target: Path, values: Mapping[str, float]) -> None:
     """Copy an FMU with other start values in its description."""
-    with Archive(place) as of:
-        changed = _starts(of, values)
-    with zipfile.ZipFile(place) as old, zipfile.ZipFile(target, "w") as new:
+    changed = _starts(fmu, values)
+    with zipfile.ZipFile(fmu.path) as old, zipfile.ZipFile(target, "w") as new:
         for entry in old.infolist():
             content = old.read(entry)
             if entry.filename == _DESCRIPTION:
@@ -86,11 +103,11 @@ def _copy(place: Path, target: Path, values: Mapping[str, float]) -> None:
             new.writestr(entry, content)
 
 
-def _starts(of: Archive, values: Mapping[str, float]) -> dict[str, str]:
+def _starts(fmu: Archive, values: Mapping[str, float]) -> dict[str, str]:
     """Return the start of every variable of which an element has a value."""
     table: dict[str, list[float]] = {}
     for name, value in values.items():
-        e = of.elements[name]
+        e = fmu.elements[name]
         table.setdefault(e.variable, list(e.starts))[e.place] = value
     return {name: " ".join(map(repr, starts)) for name, starts in table.items()}
 
@@ -107,7 +124,7 @@ def _with_starts(content: bytes, starts: Mapping[str, str]) -> bytes:
     return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
-def _kept_by(path: Path, values: Mapping[str, float]) -> tuple[Note, ...]:
+def _notes_on_binary(path: Path, values: Mapping[str, float]) -> tuple[Note, ...]:
     """Return the note that the binary of an FMU starts with other values than its description."""
     try:
         with Fmu(path) as fmu, fmu.open(fmu.interfaces()[0]) as instance:
@@ -115,7 +132,7 @@ def _kept_by(path: Path, values: Mapping[str, float]) -> tuple[Note, ...]:
             read = instance.get(list(values))
     except PsaError:
         return ()
-    items = [
+    other = [
         n for (n, v), r in zip(values.items(), read, strict=True) if abs(r - v) > _SAME * abs(v)
     ]
-    return (note("starts_in_binary", names=tuple(items)),) if items else ()
+    return (note("starts_in_binary", names=tuple(other)),) if other else ()

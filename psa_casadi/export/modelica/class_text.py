@@ -33,7 +33,7 @@ from psa_casadi.shapes import direction, magnitude_power, rate_magnitude, signed
 from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
 
 _WIDTH = 100
-#: What a connector stands for, and those of its signals that it determines.
+#: The signals that a connector replaces, and those of them that it determines.
 CONNECTORS = {
     "pins": (("voltage", "current"), ("voltage",)),
     "output": (("displacement", "load_force"), ("load_force",)),
@@ -46,8 +46,8 @@ CONNECTORS = {
 IDENTIFIERS = ("pin_p", "pin_n", "flange_a", "flange_b")
 
 #: Parts that have a name wherever a model has their symbols: unit, meaning, and how they are made.
-#: Only a stack has a stroke, which stands in the way of static_stiffness: the k of another model
-#: may be anything.
+#: static_stiffness asks for the stroke first, which only a stack has: the k of another model may be
+#: anything.
 PARTS: dict[str, tuple[str, str, Callable[[Symbols], Expression]]] = {
     "voltage_direction": ("1", "smooth sign of the voltage rate", direction),
     "voltage_speed": ("V/s", "magnitude of the voltage rate", rate_magnitude),
@@ -71,7 +71,7 @@ PARTS: dict[str, tuple[str, str, Callable[[Symbols], Expression]]] = {
         lambda s: s.k_c * (s.tip_position - s.x_f) + s.c_c * (s.tip_velocity - s.v_f)),
 }  # fmt: skip
 #: A repeated expression of this many operations and symbols, or more, gets a variable.
-_WORTH_A_NAME = 8
+_LEAST_NAMED_SIZE = 8
 #: These stay in place: a tool takes a variable that is one of them for discrete.
 _NEVER_NAMED = frozenset({"sign", "lt", "le", "eq", "ne", "not", "and", "or", "if"})
 
@@ -153,15 +153,15 @@ def _declarations_of_components(
     lines: list[str] = []
     states = {s.name: s for s in model.structure.states}
     for component in model.components:
-        item: list[tuple[Parameter | State, str]] = [
+        declared: list[tuple[Parameter | State, str]] = [
             (p, "final parameter Real" if p.name in fixed else "parameter Real")
             for p in component.parameters
         ]
-        item += [(states[s.name], "Real") for s in component.states]
-        item += [(s, "discrete Real") for s in component.sampled]
+        declared += [(states[s.name], "Real") for s in component.states]
+        declared += [(s, "discrete Real") for s in component.sampled]
         lines += _section(
             f"{component.name}: {component.description}",
-            [_declaration(model, it, names[it.name], prefix) for it, prefix in item],
+            [_declaration(model, it, names[it.name], prefix) for it, prefix in declared],
         )
     return lines
 
@@ -169,8 +169,8 @@ def _declarations_of_components(
 def _declaration(
     model: Model, it: Input | Output | Parameter | State, name: str, prefix: str
 ) -> str:
-    displayed = string(unit_text(it.display_unit)) if it.display_unit else None
-    stated, value = {"unit": string(unit_text(it.unit)), "displayUnit": displayed}, ""
+    display = string(unit_text(it.display_unit)) if it.display_unit else None
+    stated, value = {"unit": string(unit_text(it.unit)), "displayUnit": display}, ""
     if isinstance(it, Parameter):
         for end, bound in zip(("min", "max"), it.bounds, strict=True):
             if not math.isinf(bound):
@@ -300,7 +300,7 @@ def _equations(model: Model, identifiers: Identifiers) -> _Equations:
 
 
 def variable_names(structure: Structure, identifiers: Identifiers) -> dict[str, str]:
-    """Return the Modelica names of symbols, balances and outputs; `time` is Modelica's own."""
+    """Return the Modelica names of symbols, balances and outputs; `time` is Modelica's."""
     s, used = structure, _used(structure)
     symbols: list[Input | Parameter | State] = [*s.inputs, *s.parameters, *s.states, *s.sampled]
     wanted = [q.name for q in symbols]
@@ -323,9 +323,9 @@ def _outputs(structure: Structure) -> Iterator[tuple[str, Expression]]:
     for output in s.outputs:
         expression = s.out[output.name]
         if output.name == "velocity" and "displacement" in s.balances:
-            displayed = _written_out(s.balances["displacement"], s, list(s.balances))
+            position = _written_out(s.balances["displacement"], s, list(s.balances))
             rates = ca.vertcat(*[ca.SX.sym(f"der({q.name})") for q in s.states])
-            expression = ca.jtimes(displayed, s.x, rates) + ca.jacobian(displayed, s.time)
+            expression = ca.jtimes(position, s.x, rates) + ca.jacobian(position, s.time)
         if not (output.name in s.symbols and is_symbol(expression, output.name)):
             yield output.name, expression
 
@@ -346,7 +346,7 @@ def _written_out(expression: Expression, structure: Structure, names: Sequence[s
 
 
 def _before(name: str) -> str:
-    """Return the name of the symbol that stands for a sampled state before an instant."""
+    """Return the name of the symbol of a sampled state before an instant."""
     return f"pre({name})"
 
 
@@ -361,8 +361,7 @@ def _following(structure: Structure) -> dict[str, Expression]:
     more = [""]
     while more:
         reached = ca.vertcat(s.z, *(s.symbols[name] for name in moving))
-        others = (item for item in s.balances.items() if item[0] not in moving)
-        more = [name for name, terms in others if ca.depends_on(terms, reached)]
+        more = [n for n, b in s.balances.items() if n not in moving and ca.depends_on(b, reached)]
         moving += more
     earlier = ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(_before(q.name)) for q in s.sampled))
     return {
@@ -381,9 +380,11 @@ def _name_parts(
     """
     chosen: dict[int, tuple[str | None, str]] = {}
     below = graph.below(roots)
-    known = _known_parts(Symbols(structure.symbols))
-    expressions = [expression for *_, expression in known]
-    for (name, unit, meaning, _), k in zip(known, graph.read(expressions), strict=True):
+    for name, (unit, meaning, made) in PARTS.items():
+        try:
+            (k,) = graph.read([made(Symbols(structure.symbols))])
+        except AttributeError:  # the model has not all of its symbols
+            continue
         if k in below and k not in named:
             named[k], chosen[k] = identifiers.new(name), (unit, meaning)
     owners = _owners(graph, structure, later)
@@ -395,27 +396,14 @@ def _name_parts(
     for k in present:
         node = graph.nodes[k]
         sizes[k] = 1 + sum(sizes[a] for a in node.arguments)
-        is_worth_it = sizes[k] >= _WORTH_A_NAME and uses[k] > 1
-        if is_worth_it and k not in named and node.operation not in _NEVER_NAMED:
+        is_repeated = sizes[k] >= _LEAST_NAMED_SIZE and uses[k] > 1
+        if is_repeated and k not in named and node.operation not in _NEVER_NAMED:
             owner = owners.get(k, "shared")
-            named[k], chosen[k] = (
-                identifiers.new(f"{owner}_part"),
-                (None, f"repeated part of {owner}"),
-            )
+            named[k] = identifiers.new(f"{owner}_part")
+            chosen[k] = None, f"repeated part of {owner}"
         if k in named:
             sizes[k] = 1
     return chosen
-
-
-def _known_parts(symbols: Symbols) -> list[tuple[str, str, str, Expression]]:
-    """Return name, unit, meaning and expression of the parts whose symbols the model has."""
-    items = []
-    for name, (unit, meaning, made) in PARTS.items():
-        try:
-            items.append((name, unit, meaning, made(symbols)))
-        except AttributeError:
-            continue
-    return items
 
 
 def _owners(graph: Graph, structure: Structure, later: Mapping[str, Expression]) -> dict[int, str]:
@@ -445,10 +433,10 @@ def _terms(
     terms: list[tuple[str, str]] = []
     for name, term in reversed(contributions[1:]):
         node = graph.nodes[number]
-        (item,) = graph.read([term])
-        if node.operation == "add" and node.arguments[1] == item:
+        (root,) = graph.read([term])
+        if node.operation == "add" and node.arguments[1] == root:
             sign = "+ "
-        elif node.operation == "sub" and graph.add("neg", node.arguments[1]) == item:
+        elif node.operation == "sub" and graph.add("neg", node.arguments[1]) == root:
             sign = "- "
         else:
             return ((printer.definition(number), ""), *terms)

@@ -1,9 +1,9 @@
 """CasADi expressions as Modelica text, with the fewest parentheses that keep their order.
 
 A pair of CasADi's conditional zeros becomes an if-expression. Every tool reads `a*(-b)`, `(-2)^2`
-and `(a^b)^c` alike; none of them is written without its parentheses. A comparison is a Boolean;
-where a number is wanted it becomes an if-expression. `==` of Real variables is not Modelica outside
-functions: `a <= b and a >= b` says the same.
+and `(a^b)^c` in the same way; none of them is written without its parentheses. A comparison is a
+Boolean; where a number is wanted it becomes an if-expression. `==` of Real variables is not
+Modelica outside functions: `a <= b and a >= b` is the same.
 
 Source: Modelica Language Specification 3.6, sections 2.3 (words), 3.2 (precedence), 3.7.
 """
@@ -17,13 +17,13 @@ import casadi as ca
 from psa_casadi.errors import InputError
 from psa_casadi.model.graph import PLAINLY, ExpressionGraph, square
 
-#: CasADi's operations that are printed, all of them under their own names, but for these.
-_OWN_NAMES = (
+#: CasADi's operations that are printed under their names in CasADi; the others follow.
+_SAME_NAMES = (
     "add sub mul div neg pow sqrt exp log sin cos tan asin acos atan atan2 sinh cosh tanh sign"
     " lt le eq ne not and or"
 )
 _OPERATIONS: dict[int, str] = {
-    **{getattr(ca, f"OP_{name.upper()}"): name for name in _OWN_NAMES.split()},
+    **{getattr(ca, f"OP_{name.upper()}"): name for name in _SAME_NAMES.split()},
     ca.OP_CONSTPOW: "pow",
     ca.OP_FABS: "abs",
     ca.OP_FMIN: "min",
@@ -40,7 +40,7 @@ def _asinh(graph: ExpressionGraph, x: int) -> int:
     return graph.add("mul", graph.add("sign", x), size)
 
 
-#: Operations of CasADi that Modelica says in other words.
+#: Operations of CasADi that Modelica writes by other operations.
 _REWRITTEN: dict[int, Callable[..., int]] = {
     **PLAINLY,
     ca.OP_LOG1P: lambda g, x: g.add("log", g.add("add", g.add("constant", value=1.0), x)),
@@ -77,7 +77,7 @@ RESERVED = frozenset(_WORDS.split())
 
 
 def check_identifier(name: str, what: str) -> None:
-    """Refuse a name that a Modelica class cannot have; `what` says what it would name."""
+    """Refuse a name that a Modelica class cannot have; `what` is what it would name."""
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or name in RESERVED:
         raise InputError(
             f"'{name}' cannot name {what}; use letters, digits, underscores, no digit first, and"
@@ -106,7 +106,7 @@ class Identifiers:
 def number(value: float, what: str) -> str:
     """Return the shortest text that reads back as the same double, a sign in front if negative.
 
-    Raises InputError for nan and infinity, which Modelica cannot write; `what` says of what.
+    Raises InputError for nan and infinity, which Modelica cannot write; `what` is the number.
     """
     if not math.isfinite(value):
         raise InputError(
@@ -184,7 +184,7 @@ class Printer:
         return self._expression(node)[0]
 
     def summand(self, node: int) -> str:
-        """Return a node as it stands behind a plus or a minus."""
+        """Return a node as the text behind a plus or a minus."""
         return _enclosed(self._number(node), _PRODUCT)
 
     def _number(self, node: int) -> Text:
@@ -225,9 +225,9 @@ class Printer:
             return form.format(*(_enclosed(self._number(a), _SUM) for a in it.arguments)), binding
         if it.operation == "not":
             return f"not {_enclosed(self._condition(it.arguments[0]), _RELATION)}", _NOT
-        item = _CONNECTED[it.operation]
-        sides = (_enclosed(self._condition(a), item + 1) for a in it.arguments)
-        return f" {it.operation} ".join(sides), item
+        binding = _CONNECTED[it.operation]
+        sides = (_enclosed(self._condition(a), binding + 1) for a in it.arguments)
+        return f" {it.operation} ".join(sides), binding
 
 
 def _enclosed(written: Text, at_least: int) -> str:

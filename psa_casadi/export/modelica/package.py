@@ -1,9 +1,9 @@
 """A Modelica package of a model: signals, connectors, examples, in one file of fixed text.
 
-The class with pins and a flange says which signals of a model they stand for. A flange is a
+The class with pins and a flange replaces signals of a model by them. A flange is a
 two-port: what the stack does to its load, the load does to the stack. The paper's one-way cascade
 is none, since its bonding layers do not push back on the wafers. The class has the reaction,
-`reciprocal_coupling` at a gain of 1, and says so.
+`reciprocal_coupling` at a gain of 1, and its documentation states it.
 """
 
 import os
@@ -210,8 +210,8 @@ def documentation(model: Model, **more: object) -> str:
     That is a table of `components`; the `wiring` of pins and flange; the reaction in a `cascade`;
     of the package whether the states are at `rests`, and whether some are `sampled`.
     """
-    statement = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
-    about = [t for t in (describe(model), statement, f"Written by {generation_tool()}.") if t]
+    terms = "; ".join(f"{name}: {text}" for name, text in model.publication.stated.items())
+    about = [t for t in (describe(model), terms, f"Written by {generation_tool()}.") if t]
     every = dict.fromkeys(("components", "wiring", "cascade", "rests", "sampled")) | more
     text = filled("modelica.html", about=map(_plain, about), values=model.values, **every)
     return f"Documentation(info={string(text.rstrip())})"

@@ -1,5 +1,5 @@
 
-static void {{ function }}_part({{ given }}) {
+static void {{ function }}_part({{ arguments }}) {
     (void)t, (void)u, (void)change;
 {% for line in lines %}
     {{ line }}
@@ -12,7 +12,7 @@ static void {{ function }}_part({{ given }}) {
 {% endfor %}
 }
 
-void {{ function }}({{ given }}) {
+void {{ function }}({{ arguments }}) {
     double now[{{ [inputs, 1] | max }}] = {0.0}, part[{{ [inputs, 1] | max }}] = {0.0};
     for (int k = 0; k < {{ plan.substeps }}; ++k) {
         for (int i = 0; i < {{ inputs }}; ++i) {

@@ -30,7 +30,7 @@ Do not compile it with -ffast-math: sums that keep what rounding takes would be 
 
 {% if errors %}
 {% filter wrapped %}
-Error of {{ shown }}, the largest one over its range, by psa_casadi's
+Error of {{ output }}, the largest one over its range, by psa_casadi's
 stepper at a tolerance of 1e-10, on voltages of {{ steps }} steps over the rated range:
 {% endfilter %}
 

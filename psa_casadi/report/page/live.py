@@ -14,7 +14,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.effects.patches import GAIN
 from psa_casadi.errors import InputError
-from psa_casadi.export.web import begun_module
+from psa_casadi.export.web import future_module
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import record_start
@@ -135,7 +135,7 @@ class LiveModel:
 
 def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> LiveModel:
     """Start to compile the model of a diagnosis for its page; `rows` are its series."""
-    module, beyond, share, text = begun_module(d.model), list[FloatArray](), 1.0, ""
+    module, beyond, share, text = future_module(d.model), list[FloatArray](), 1.0, ""
     if isinstance(d, StackDiagnosis):
         # the page's other errors are judged by the noise of all records together
         share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
@@ -149,7 +149,7 @@ def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> Liv
 def live_fit(identification: Identification, rows: Sequence[Series]) -> LiveModel:
     """Start to compile the model of an identification for its page; `rows` are its series."""
     records = _fitted_records(identification, identification.fit, rows)
-    return LiveModel(identification.model, begun_module(identification.model), records)
+    return LiveModel(identification.model, future_module(identification.model), records)
 
 
 def live_design(
@@ -169,7 +169,7 @@ def live_design(
     curve, none = Curve("model", colours.EXTENDED, displacement), np.zeros(len(time), dtype=bool)
     series = Series("design", time, voltage, aim, (curve,), none, noise=0.0, counts=False)
     row = LiveRecord(series, {"voltage": voltage}, rest=rest)
-    return LiveModel(model, begun_module(model), [row], aim=words, design=True)
+    return LiveModel(model, future_module(model), [row], aim=words, design=True)
 
 
 def live_experiment(model: Model, record: Signals) -> LiveModel:
@@ -188,7 +188,7 @@ def live_experiment(model: Model, record: Signals) -> LiveModel:
             against=in_brackets(along, record.units[along]),
         )  # fmt: skip
         rows.append(live_record(series, record.columns, output=output.name))
-    return LiveModel(model, begun_module(model), rows, aim="design", design=True)
+    return LiveModel(model, future_module(model), rows, aim="design", design=True)
 
 
 def _fitted_records(

@@ -53,7 +53,7 @@ EMULATED = (*_EMULATORS, "x86_64-windows")
 
 
 def tool(*names: str) -> str:
-    """Return the path of the first program found; skips the test, or fails it if required."""
+    """Return the path of the first program; skips the test without one, or fails it if required."""
     for name in names:
         text = shutil.which(name) or shutil.which(_ELSEWHERE.get(name, name))
         if text:
@@ -147,7 +147,7 @@ def importer_arguments(fmi: int, library: Path, steps: tuple[int, int]) -> list[
 
 
 def native() -> Runner:
-    """Return the way to run this machine's own programs; skips where it is not x86-64 Linux."""
+    """Return the way to run this machine's programs; skips where it is not x86-64 Linux."""
     if os.uname().sysname != "Linux" or os.uname().machine != "x86_64":
         pytest.skip("the emulators are used on Linux, x86-64")
     return Runner(PLATFORMS["x86_64-linux"])
@@ -172,7 +172,7 @@ def linked(
     """Compile C files of this folder together with the sources of the FMU; return the program.
 
     `command` is a compiler with its flags; the warnings of `STRICT` are errors. `inside` is a
-    folder of other sources of the FMU than its own.
+    folder of other sources of the FMU.
     """
     inside = inside or everywhere(fmi) / "sources"
     sources = [*(HERE / n for n in files), *sorted(inside.glob("*.c"))]

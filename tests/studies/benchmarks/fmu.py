@@ -29,8 +29,7 @@ from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fixed_step.export import VOLTAGES, fixed_step
 from psa_casadi.export.fmu.sources import compiled_files, exported_texts
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError
-from psa_casadi.export.importer.masters import co_simulate
-from psa_casadi.export.importer.signals import Signals
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler

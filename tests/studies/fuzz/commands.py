@@ -23,7 +23,7 @@ from pathlib import Path
 from random import Random
 
 from psa_casadi.errors import PsaError
-from psa_casadi.export.importer.model_with_fmu import load_model
+from psa_casadi.export.importer.fmu_model import load_model
 from tests.studies.fuzz.campaign import (
     CRASH,
     FOREIGN,
