@@ -155,8 +155,7 @@ def _correlated(r: float, columns: FloatArray) -> FloatArray:
     """Return S q for columns q: their sum over all samples, weighted with r^|i-j|."""
     ahead = filtered([1.0], [1.0, -r], columns)
     behind = filtered([1.0], [1.0, -r], columns[::-1])[::-1]
-    both: FloatArray = ahead + behind - columns
-    return both
+    return ahead + behind - columns
 
 
 def _beside(columns: FloatArray) -> FloatArray:

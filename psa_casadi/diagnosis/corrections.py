@@ -118,8 +118,7 @@ def time_constants(records: Sequence[Record]) -> FloatArray:
     shortest = min(r.sample_time for r in records)
     longest = _LONGEST * max(r.duration for r in records)
     count = max(2, round(_PER_DECADE * float(np.log10(longest / shortest))))
-    values: FloatArray = np.geomspace(shortest, longest, count)
-    return values
+    return np.geomspace(shortest, longest, count)
 
 
 def _modes(s: Signals, k: int) -> FloatArray:
@@ -379,8 +378,7 @@ class _Following:
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns at the used samples, whitened, over the noise."""
-        white: FloatArray = self.colour.whiten(columns) / self.colour.level
-        return white
+        return self.colour.whiten(columns) / self.colour.level
 
     def beside(self, columns: FloatArray) -> FloatArray:
         """Return columns over the noise, whitened, less what the parameters can follow."""

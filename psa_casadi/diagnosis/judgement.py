@@ -18,6 +18,7 @@ from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
+    NOISE,
     Candidate,
     Cause,
     Diagnosis,
@@ -56,12 +57,6 @@ class Weighed:
     share: float
     each: Mapping[str, float]
     corrections: Sequence[Correction]
-    limits: Thresholds
-
-    @property
-    def adds(self) -> bool:
-        """Do the causes remove more than their form may be wrong by, named or not?"""
-        return self.share > self.limits.form
 
     @property
     def least(self) -> tuple[str, float]:
@@ -86,7 +81,7 @@ class Judge:
 
     def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
         self.steps, self.task, self.driven = tuple(steps), task, driven
-        self.first, self.last = self.steps[0], self.steps[-1]
+        self.first, self.last, self.searched = self.steps[0], self.steps[-1], self.steps[:-1]
         self.experiments, self.limits = task.experiments, task.limits
         self._left: dict[Step, Remaining] = {}
 
@@ -123,18 +118,20 @@ class Judge:
         """Return the place and the kind of an effect."""
         return effect.belongs_to, effect.kind
 
-    # What is said of any
+    # What every kind of device has
+
+    @cached_property
+    def scale(self) -> Scale:
+        """The evidence of hypotheses over the base, by the noise that the best one leaves."""
+        return Scale(self.first.view.of, self.last.screening.colour, self.limits)
 
     def left(self, step: Step) -> Remaining:
         """Return what the model of a step leaves, in fitted samples or in held-out ones."""
         if step not in self._left:
             test, beyond = step.test, self.unseen(step)
-            p = test.p_value if beyond is None else min(test.p_value, beyond[1])
-            if test.alarm:
-                remaining = Remaining(False, p, test.finding)
-            else:
-                remaining = Remaining(True, p) if beyond is None else Remaining(False, p, beyond[0])
-            self._left[step] = remaining
+            finding, p = (NOISE, 1.0) if beyond is None else beyond
+            finding = test.finding if test.alarm else finding
+            self._left[step] = Remaining(finding is NOISE, min(test.p_value, p), finding)
         return self._left[step]
 
     def _shown(self, evidence: float) -> Shown:
@@ -156,7 +153,6 @@ class Judge:
         """
         result = self.corrections(before) if beside else ()
         removed = removed_from(self.experiments, before.shown, self.noise)
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
@@ -164,11 +160,10 @@ class Judge:
             if len(rows) > 1 and base > MISSED * floor
         }
         return Weighed(
-            evidence=scale.evidence(after) - scale.evidence(before),
+            evidence=self.scale.evidence(after) - self.scale.evidence(before),
             share=removed.from_base(after.shown),
             each=each,
             corrections=result,
-            limits=self.limits,
         )
 
     @cached_property
@@ -177,28 +172,30 @@ class Judge:
         both = self.first.view.of, self.last.view.of
         return self.weigh(*both, beside=self.missing and self.driven)
 
+    @property
+    def adds(self) -> bool:
+        """Whether the causes remove more than their form may be wrong by, named or not."""
+        return self.weighed.share > self.limits.form
+
     @cached_property
     def each(self) -> dict[str, Weighed]:
         """Every cause by itself, against corrections of the model without it, all others kept."""
-        last, weigheds = self.last.view.of, {}
-        for s in self.steps if self.doubt is None else ():
-            if s.chosen is not None and s.without is not None:
-                if s.without.fit is self.first.fit:
-                    weigheds[s.cause.name] = self.weighed
-                    continue
-                weighed = self.weigh(s.without, last)
-                weigheds[s.cause.name] = replace(
-                    weighed, corrections=self._instead(weighed.corrections)
-                )
-        return weigheds
+        pairs = [(s.cause.name, s.without) for s in self.searched if s.without is not None]
+        return {n: self._alone(less) for n, less in pairs if self.doubt is None}
 
-    def _instead(self, corrections: Sequence[Correction]) -> list[Correction]:
-        """Return corrections with what they add in a cause's place alone.
+    def _alone(self, less: Hypothesis) -> Weighed:
+        """Weigh one cause against what corrections add in its place alone.
 
         What they add beside all causes as well is no word against one of these.
         """
+        if less.fit is self.first.fit:
+            return self.weighed
+        weighed = self.weigh(less, self.last.view.of)
         more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
-        return [replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in corrections]
+        rest = [
+            replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in weighed.corrections
+        ]
+        return replace(weighed, corrections=[replace(c, evidence=e) for c, e in parts])
 
     @cached_property
     def _beside_last(self) -> Sequence[Correction]:
@@ -237,8 +234,8 @@ class Judge:
                 self.each[s.cause.name].corrections,
                 self.limits,
             )
-            for s in self.steps
-            if s.chosen is not None and s.cause.name in self.each
+            for s in self.searched
+            if s.cause.name in self.each
         }
 
     @property
@@ -256,15 +253,15 @@ class Judge:
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
         unnamed = self.unnamed
-        items = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
+        named = [s for s in self.searched if s.cause.name not in unnamed]
         little = self.weighed.least[1] < self.least
         if not self.driven:
             return "not_driven"
         if not self.missing:
             return "adequate"
-        if self.doubt is not None or not items or little:
+        if self.doubt is not None or not named or little:
             return "unexplained"
-        if told_from(items[0], self.limits):
+        if told_from(named[0], self.limits):
             return "ambiguous"
         more = self.vague or not self.left(self.last).white
         return "partly_explained" if more else "cause_named"
@@ -273,9 +270,7 @@ class Judge:
     def kept(self) -> tuple[Step, ...]:
         """The steps to the causes that the extended model holds, named or not."""
         weak = self.verdict == "unexplained" and self.doubt is None and not self.vague
-        if self.verdict in NAMING or (weak and self.weighed.adds):
-            return tuple(s for s in self.steps if s.chosen is not None)
-        return ()
+        return self.searched if self.verdict in NAMING or (weak and self.adds) else ()
 
     @property
     def final(self) -> Step:
@@ -361,7 +356,7 @@ class Judge:
 
     def withdrawn(self) -> tuple[Note, ...]:
         """Return which names were found but not told, and why."""
-        names = tuple(s.cause.name for s in self.steps if s.chosen is not None)
+        names = tuple(s.cause.name for s in self.searched)
         if not names:
             return ()
         (output, share), kept = self.weighed.least, False
@@ -371,7 +366,7 @@ class Judge:
             why = self._better()
         else:
             more = self.last.test.alarm
-            why, kept = note("little", least=self.least, more=more), self.weighed.adds
+            why, kept = note("little", least=self.least, more=more), self.adds
         return (
             note("withdrawn", names=names, evidence=self.weighed.evidence, share=max(0.0, share),
                  output=output, kept=kept, why=why),
@@ -467,17 +462,18 @@ class ModelJudge(Judge):
     @cached_property
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
-        attached = [self.table[s.cause.name] for s in self.kept]
-        return model_of(self.base, self.final.fit, attached, self.experiments)
+        effects = [self.table[s.cause.name] for s in self.kept]
+        return model_of(self.base, self.final.fit, effects, self.experiments)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions beside a hypothesis; none beside causes that leave no structure."""
         view = self.views[of.names]
         if of.causes and not view.test.alarm:
             return ()
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        effects = [self.table[c.name] for c in of.causes]
-        return fit_free_functions(view, self.task, self.base, effects, scale)
+        return fit_free_functions(view, self.task, self.base, self._attached(of), self.scale)
+
+    def _attached(self, of: Hypothesis) -> list[Attached]:
+        return [self.table[c.name] for c in of.causes]
 
     @cached_property
     def told_correction(self) -> Correction | None:
@@ -485,9 +481,8 @@ class ModelJudge(Judge):
         best, of = self.best_correction, self.final.view.of
         if not isinstance(best, FreeFunction):
             return best
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        effects = [self.table[c.name] for c in of.causes]
-        law = formula_of(best, of, self.task, self.base, effects, scale, self.whole)
+        effects = self._attached(of)
+        law = formula_of(best, of, self.task, self.base, effects, self.scale, self.whole)
         return best if law is None else replace(law, open_to=best.open_to)
 
     def unseen(self, step: Step) -> tuple[Note, float] | None:
@@ -551,10 +546,7 @@ class ModelJudge(Judge):
         if times < _CANCEL or size is None or both is None:
             return ()
         alone, together = (size.value, size.unit), (both.value, both.unit)
-        statement = note(
-            "cancel", effect=effect, output=size.output, alone=alone, together=together
-        )
-        return (statement,)
+        return (note("cancel", effect=effect, output=size.output, alone=alone, together=together),)
 
     def _left_out(self) -> tuple[Note, ...]:
         """Return which causes are clearly likelier than the best, but may only correct its form.

@@ -517,20 +517,17 @@ class Span:
     @cached_property
     def information(self) -> FloatArray:
         """W'W (m, m)."""
-        values: FloatArray = self.norms[:, None] * self.gram * self.norms
-        return values
+        return self.norms[:, None] * self.gram * self.norms
 
     @cached_property
     def covariance(self) -> FloatArray:
         """That of the weights (m, m), with their prior."""
         weighted = self.information + np.eye(len(self.norms)) / LINEAR_PRIOR**2
-        values: FloatArray = np.linalg.inv(weighted).astype(np.float64)
-        return values
+        return np.linalg.inv(weighted).astype(np.float64)
 
     def gains(self, t: FloatArray) -> FloatArray:
         """Return the weights (..., m), in ordinary sizes, that fit best."""
-        values: FloatArray = (t * self.norms) @ self.covariance
-        return values
+        return (t * self.norms) @ self.covariance
 
     def decrease(self, t: FloatArray) -> FloatArray:
         """Return D (...), less what noise makes of more weights than one, at least 0.

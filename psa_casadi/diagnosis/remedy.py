@@ -114,8 +114,7 @@ def _shown(model: Model, t: FloatArray, u: FloatArray, x0: FloatArray | None = N
     """Return what a model shows (n,), from rest if no start is given."""
     started = start_on(model, t, u).x if x0 is None else x0
     steps, _ = accurate(model, t, u, started, rtol=_RTOL, hold="linear")
-    y: FloatArray = steps.y[:, model.output_names.index(output_of(model) or "displacement")]
-    return y
+    return steps.y[:, model.output_names.index(output_of(model) or "displacement")]
 
 
 def _played(

@@ -264,14 +264,12 @@ def independent(columns: FloatArray) -> FloatArray:
         u, s, _ = np.linalg.svd(scaled, full_matrices=False)
     except np.linalg.LinAlgError:  # divide and conquer may fail where the plain method does not
         u, s, _ = scipy.linalg.svd(scaled, full_matrices=False, lapack_driver="gesvd")
-    basis: FloatArray = u[:, s > 1e-7 * s[0]]
-    return basis
+    return u[:, s > 1e-7 * s[0]]
 
 
 def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
     """Return vectors (samples,) or columns less what an orthonormal basis spans of them."""
-    projected: FloatArray = vectors - basis @ (basis.T @ vectors)
-    return projected
+    return vectors - basis @ (basis.T @ vectors)
 
 
 def _threshold(

@@ -149,8 +149,7 @@ def standard_voltage(period: float, span: float) -> tuple[FloatArray, FloatArray
 
 
 def _raised(way: FloatArray) -> FloatArray:
-    risen: FloatArray = 0.5 * (1.0 - np.cos(np.pi * way))
-    return risen
+    return 0.5 * (1.0 - np.cos(np.pi * way))
 
 
 def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
