@@ -486,7 +486,7 @@ def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:
 
 def _steps(base: Fit, task: Task) -> list[Step]:
     """Search from a base fit and keep the best."""
-    steps = steps_of(best_first(base, task), task)
+    steps = steps_of(best_first(base, task))
     task.keep(steps[-1].fit)
     return steps
 

@@ -192,10 +192,8 @@ class Judge:
             return self.weighed
         weighed = self.weigh(less, self.last.view.of)
         more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
-        rest = [
-            replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in weighed.corrections
-        ]
-        return replace(weighed, corrections=[replace(c, evidence=e) for c, e in parts])
+        pairs = [(c, c.evidence - more.get(c.name, 0.0)) for c in weighed.corrections]
+        return replace(weighed, corrections=[replace(c, evidence=e) for c, e in pairs])
 
     @cached_property
     def _beside_last(self) -> Sequence[Correction]:
@@ -444,7 +442,7 @@ class ModelJudge(Judge):
     def __init__(
         self, known: Known, base: Model, table: Mapping[str, Attached], whole: Sequence[Experiment]
     ) -> None:
-        super().__init__(steps_of(known, known.task), known.task)
+        super().__init__(steps_of(known), known.task)
         self.known, self.base, self.table, self.whole = known, base, table, whole
         self.views = {s.view.of.names: s.view for s in self.steps}
         self.views |= {s.beside.of.names: s.beside for s in self.steps if s.beside is not None}

@@ -154,7 +154,7 @@ def alternatives(
         ):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
-            fitted = _fitted(step, name, experiments)
+            fitted = _fitted(step, name)
             if fitted is None:
                 continue
             try:
@@ -169,13 +169,13 @@ def alternatives(
     return tuple(items)
 
 
-def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def _fitted(step: Step, name: str) -> Hypothesis | None:
     """Return the hypothesis with another effect in a cause's place, fitted to its end."""
     known = step.instead.get(name)
     if known is None and step.beside is not None:
         starts = step.beside.starts_of(name)
-        known = with_cause(step.beside.of, experiments, starts) if starts else None
-    return known if known is None or known.final else to_end(known, experiments)
+        known = with_cause(step.beside.of, starts) if starts else None
+    return known if known is None or known.final else to_end(known)
 
 
 def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
@@ -352,7 +352,7 @@ class StackJudge(Judge):
             noise=self.floors,
             misfit=misfits,
             remainder=_misfits(experiments, self.errors, self.floors) if self.kept else misfits,
-            contenders=contenders(self.first, experiments, limits) if ambiguous else (),
+            contenders=contenders(self.first, limits) if ambiguous else (),
             alternatives=alternatives(
                 self.kept, final.fit, self.task, stiffness_given=self.scale_given
             ),

@@ -113,7 +113,7 @@ class _Search:
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
             self.task.progress("all causes to the end")
-            self.known.note(together(best, self.task.experiments))
+            self.known.note(together(best))
         self.known.conclude()
         if self.left:
             left = tuple(dict.fromkeys(self.left))
@@ -148,7 +148,7 @@ class _Search:
                 return item
         if best.causes and self.once("exchange", best.names):
             if self.does("exchange"):
-                exchange(best, self.known, self.task)
+                exchange(best, self.known)
             return self.next()
         if self.known.is_open(best):
             return self.next() if self.otherwise() else self.rejected()
@@ -201,7 +201,7 @@ class _Search:
             less = self.known.found.get(h.names - {cause.name})
             if (less is None or not cause.more_of) and self.does("base again"):
                 self.task.progress(f"without {cause.name}")
-                self.known.note(without(h, cause, self.task.experiments, less))
+                self.known.note(without(h, cause, less))
         return new
 
     def unseen(self, h: Hypothesis) -> bool:
@@ -240,26 +240,25 @@ class _Search:
     @stage("fits of candidates")
     def add_causes(self, h: Hypothesis, view: View) -> None:
         """Fit with one more cause, from the hypothesis, afresh, and the leading ones to the end."""
-        task, experiments = self.task, self.task.experiments
         leading = [s for s in view.leading() if self.known.different(s[0].direction.effect, h)]
         leading = [s for s in leading if (h.fit, s[0].direction.effect.name) not in self.tried]
         names = [scores[0].direction.effect.name for scores in leading]
         if not names:
             return
         self.tell(h, f"fitting {', '.join(names)}")
-        for result in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
+        for result in side_by_side(lambda s: with_cause(h, s), leading[:_PACE]):
             self.known.note(result)
         self.known.remember(h, *names)
         best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
         goal = self.known.near(h, best) if best is not None else np.inf
         rest = leading[_PACE:]
         if rest and self.does("other effects"):
-            for result in side_by_side(lambda s: with_cause(h, experiments, s, goal), rest):
+            for result in side_by_side(lambda s: with_cause(h, s, goal), rest):
                 self.known.note(result)
-        if "fits afresh" not in task.method.without:
+        if "fits afresh" not in self.task.method.without:
             self.fit_afresh(h, view)
             if self.does("other parents"):
-                fit_from_other_parents(h, self.known, task)
+                fit_from_other_parents(h, self.known)
         leaders = [c for c in self.known.leaders(h) if not c.final]
         self.known.finish(leaders[: FINALISTS if self.does("finalists") else 1])
 
@@ -269,7 +268,7 @@ class _Search:
 
         Where fast records show several, or where one leaves structure.
         """
-        name, experiments = STRUCTURAL_MODE.name, self.task.experiments
+        name = STRUCTURAL_MODE.name
         if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
             return False
         less = self.known.found.get(h.names - {name})
@@ -279,13 +278,13 @@ class _Search:
             return False
         self.shaken[less.names] = less.fit
         self.tell(less, "several modes at once")
-        result = with_modes(less, experiments)
+        result = with_modes(less)
         if result is None:
             return False
         self.known.note(result)
         single = view.starts_of(name) if less is h else []
         if single:
-            self.known.note(with_cause(h, experiments, single))
+            self.known.note(with_cause(h, single))
         self.known.remember(less, result.causes[-1].name, name)
         return self.known.best().names == result.names
 
@@ -294,7 +293,7 @@ class _Search:
         if self.sets_of is self.known.root or not self.does("several at once"):
             return
         self.sets_of = self.known.root
-        fit_sets(self.known, self.task, h)
+        fit_sets(self.known, h)
 
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
@@ -306,7 +305,7 @@ class _Search:
             if best.fit.rms < _SETTLED * floor or not self.does("fits afresh"):
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
-            self.known.note(afresh(h, self.task.experiments, child, self.known.near(h, best)))
+            self.known.note(afresh(h, child, self.known.near(h, best)))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:
@@ -315,7 +314,7 @@ class _Search:
         done = [c.causes[-1].name for c in self.known.children(root)[:_AFRESH]]
         scores = [s for n, s in view.screening.best_by_effect().items() if n not in done]
         self.tell(root, "all other effects afresh")
-        result = any_afresh(root, self.task.experiments, scores)
+        result = any_afresh(root, scores)
         if result is not None:
             self.known.note(result)
             self.known.remember(root, result.causes[-1].name)
@@ -330,7 +329,7 @@ class _Search:
         before = self.known.found.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
-            for one in one_mode(h, before, task.experiments):
+            for one in one_mode(h, before):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)
         if before is None or has_series(h) or not self.does("resonances"):

@@ -47,7 +47,7 @@ from psa_casadi.units import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model with some causes beside the base, fitted to the records.
+    """A model with some causes beside the base, fitted to the records of `experiments`.
 
     `causes` are in the order in which the search found them; `shown` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
@@ -58,6 +58,7 @@ class Hypothesis:
 
     causes: tuple[Component, ...]
     fit: Fit
+    experiments: Sequence[Experiment]
     shown: tuple[FloatArray, ...]
     held: tuple[float, ...]
     train: tuple[float, ...]
@@ -172,13 +173,21 @@ def hypothesis(
         colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
     return Hypothesis(
-        tuple(causes), fit, displayed, held_rms, train_rms, whole, tuple(colours), final
+        tuple(causes),
+        fit,
+        experiments,
+        displayed,
+        held_rms,
+        train_rms,
+        whole,
+        tuple(colours),
+        final,
     )
 
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     """Return a hypothesis with noise that enters its model, if that is likelier."""
-    item = task.pack.entering(of.fit, task.experiments, of.shown, of.own)
+    item = task.pack.entering(of.fit, of.experiments, of.shown, of.own)
     return replace(of, own=item)
 
 
@@ -234,11 +243,9 @@ class Scale:
         return self.evidence(of) - self.limits.price * len(of.causes)
 
 
-def scale_of(
-    base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
-) -> Scale:
+def scale_of(base: Hypothesis, colour: Colour, limits: Thresholds) -> Scale:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
-    numbers = [f.number for f in base.fit.channels]
+    experiments, numbers = base.experiments, [f.number for f in base.fit.channels]
     held = tuple(sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in numbers)
     return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
@@ -336,7 +343,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     and it asks whether the residual is as large everywhere.
     """
     task.progress("screening effects")
-    fit, experiments = of.fit, task.experiments
+    fit, experiments = of.fit, of.experiments
     effects = [e for e in task.table if e not in fit.model.components]
     kept: list[Direction] = []
     if known:
@@ -390,9 +397,7 @@ _SAME = 1.0
 _END = 0.1
 
 
-def held_out_confirms(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
-) -> bool:
+def held_out_confirms(of: Hypothesis, before: Hypothesis, scale: Scale) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule is `confirmed`; a change of prediction with the sum of squares D promises D/2 over the
@@ -402,7 +407,7 @@ def held_out_confirms(
         return True
     promise = 0.0
     for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
-        rows = zip(experiments, of.shown, before.shown, strict=True)
+        rows = zip(of.experiments, of.shown, before.shown, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )

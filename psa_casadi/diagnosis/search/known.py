@@ -56,7 +56,7 @@ class Known:
         root = root_of(base, task)
         first = examine(root, task)
         self.trials = first.trials
-        item = scale_of(root, first.screening.colour, task.limits, task.experiments)
+        item = scale_of(root, first.screening.colour, task.limits)
         self.scale = replace(item, held=()) if "held out" in task.method.without else item
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
@@ -162,7 +162,7 @@ class Known:
 
         Its evidence beside `h` would be below `SHARE` of that one's, and by `NEAR` nats.
         """
-        count, reached = len(h.fit.residuals), cost_beside(best.fit, h.fit, self.task.experiments)
+        count, reached = len(h.fit.residuals), cost_beside(best, h)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
         return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
@@ -205,16 +205,16 @@ class Known:
         if "begun again" in self.task.method.without:
             return
         final = [self.found[h.names] for h in hypotheses]
-        for again in side_by_side(lambda h: begun_again(h, self.task.experiments), final):
+        for again in side_by_side(begun_again, final):
             self.note(again)
 
     def _to_end(self, h: Hypothesis) -> Hypothesis:
         """Fit a hypothesis to its end, with the noise that it leaves."""
-        experiments, ended = self.task.experiments, to_end(h, self.task.experiments)
-        levelled = self.task.pack.ended(ended.fit, experiments)
+        ended = to_end(h)
+        levelled = self.task.pack.ended(ended.fit, h.experiments)
         if levelled is ended.fit:
             return ended
-        return hypothesis(ended.causes, levelled, experiments, final=True) or ended
+        return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
 
     def worth(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
@@ -226,8 +226,8 @@ class Known:
         return all(self._worth(h, c, confirmed=confirmed, form=form) for c in h.causes)
 
     def _worth(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
-        experiments, out, pack = self.task.experiments, self.task.method.without, self.task.pack
-        if not pack.in_character(h.fit, cause, experiments):
+        out, pack = self.task.method.without, self.task.pack
+        if not pack.in_character(h.fit, cause, h.experiments):
             return False
         before = self.found.get(h.names - {cause.name})
         return before is None or (
@@ -235,11 +235,7 @@ class Known:
             and not (form and "form" not in out and self.little(h, before))
             and self.remembers(h, before, cause)
             and ("noise" in out or self.beyond_noise(h, before, cause))
-            and (
-                not confirmed
-                or "held out" in out
-                or held_out_confirms(h, before, experiments, self.scale)
-            )
+            and (not confirmed or "held out" in out or held_out_confirms(h, before, self.scale))
         )
 
     def beyond_noise(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
@@ -251,7 +247,7 @@ class Known:
         if (h, before) not in self.noises:
             result = self.exceeds(h, before)
             if result and before.own[0].autoregression.size:
-                led = as_led(h, cause, self.task.experiments)
+                led = as_led(h, cause)
                 result = led is None or self.exceeds(h, led)
             self.noises[h, before] = result
         return self.noises[h, before]
@@ -294,7 +290,7 @@ class Known:
         if (h, before) not in self.memories:
             added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
             self.memories[h, before] = self.task.pack.remembers(
-                added, before.fit, self.task.experiments, self.task.limits
+                added, before.fit, h.experiments, self.task.limits
             )
         return self.memories[h, before]
 

@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
 from psa_casadi.diagnosis.search.fits import (
     Start,
@@ -47,13 +46,14 @@ _ALONE = 3
 _RTOL = 1e-4
 
 
-def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def with_modes(before: Hypothesis) -> Hypothesis | None:
     """Fit with a series of modes; None where the residual shows fewer than two, or no fit works.
 
     Modes that a fit damps until they ring no more are left out: they stand for something else.
     """
     if "wafer_force" not in before.fit.model.structure.balances:
         return None
+    experiments = before.experiments
     even = [k for k, e in enumerate(experiments) if not e.held_out_whole and _even(e.record.time)]
     most = _ENOUGH // max(1, len(even))
     shaken, free = [], []
@@ -90,9 +90,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
     return None
 
 
-def one_mode(
-    series: Hypothesis, less: Hypothesis, experiments: Sequence[Experiment]
-) -> list[Hypothesis]:
+def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """Fit one mode in the place of a series, from each of those, and the best to the end.
 
     The series is the last cause; `less` is the hypothesis without it. The base begins where the
@@ -108,11 +106,9 @@ def one_mode(
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    results = side_by_side(
-        lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
-    )
+    results = side_by_side(lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
     best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
-    return side_by_side(lambda h: to_end(h, experiments), best)
+    return side_by_side(to_end, best)
 
 
 def _even(time: FloatArray) -> bool:
@@ -151,7 +147,7 @@ _MOST = 3
 
 
 @stage("causes judged again")
-def exchange(h: Hypothesis, known: Known, task: Task) -> None:
+def exchange(h: Hypothesis, known: Known) -> None:
     """Fit in each cause's place what the screening beside all others finds near it."""
     for cause in h.causes:
         less = known.found.get(h.names - {cause.name})
@@ -159,13 +155,13 @@ def exchange(h: Hypothesis, known: Known, task: Task) -> None:
             continue
         if len(h.causes) > 1:
             for starts in _near(h, less, known)[:_MOST]:
-                task.progress(f"{_effect(starts).name} in the place of {cause.name}")
-                _put_in_place(h, less, starts, known, task)
+                known.task.progress(f"{_effect(starts).name} in the place of {cause.name}")
+                _put_in_place(h, less, starts, known)
             known.remember(less, cause.name)
-        for copy in _copies(h, less, known, task):
+        for copy in _copies(h, less, known):
             name = copy.direction.effect.name
-            task.progress(f"{name}, which could copy {cause.name}")
-            known.note(like(h, less, copy, task.experiments, known.near(less, h)))
+            known.task.progress(f"{name}, which could copy {cause.name}")
+            known.note(like(h, less, copy, known.near(less, h)))
             known.remember(less, name)
 
 
@@ -186,37 +182,35 @@ def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
     ]
 
 
-def _put_in_place(
-    h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: Known, task: Task
-) -> None:
+def _put_in_place(h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: Known) -> None:
     """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
 
     To the end where that comes near.
     """
     goal = known.near(less, h)
-    rival = with_cause(less, task.experiments, starts, goal)
+    rival = with_cause(less, starts, goal)
     known.note(rival)
     if rival is None:
         return
     effect = _effect(starts)
-    known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments, goal))
+    known.note(in_place(h, less, h.fit, rival.fit, effect, goal))
     known.remember(less, effect.name)
     best = known.found.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
         known.finish([best])
 
 
-def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[Copy]:
+def _copies(h: Hypothesis, less: Hypothesis, known: Known) -> list[Copy]:
     """Return effects that could add what the cause not in `less` adds, but were not fitted so.
 
     A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is
     below `NEAR` might explain the data as well; a fit much worse than its copy was lost.
     """
-    pairs = zip(h.predicted, less.predicted, task.experiments, strict=True)
+    pairs = zip(h.predicted, less.predicted, h.experiments, strict=True)
     added = np.concatenate([(p - q)[e.at(h.fit.channels[0].number)] for p, q, e in pairs])
-    table = [e for e in task.table if e.name not in h.names]
+    table = [e for e in known.task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
-    power, result = copies(less.fit, added, trials, known.scale.colour, task.limits)
+    power, result = copies(less.fit, added, trials, known.scale.colour, known.task.limits)
     item = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in result.items():
@@ -239,7 +233,7 @@ _PAIRS = 2
 
 
 @stage("fits of several at once")
-def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
+def fit_sets(known: Known, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
     The cause that explains most alone, that of `h`, may stand for several and hold the search
@@ -247,7 +241,7 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     tried, as a fit that adds one cause to the other may end in another minimum than one that begins
     with both. These go to their end, since they need more steps for it.
     """
-    root, price = known.root, known.scale.limits.price
+    root, task, price = known.root, known.task, known.scale.limits.price
     view, similar = known.view(root), task.alike(root.fit)
     if not view.trials:
         return
@@ -265,32 +259,30 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes: fitting {text}")
-    goal = cost_beside(known.best().fit, root.fit, task.experiments)
+    goal = cost_beside(known.best(), root)
     ways = [with_causes]
     if "fits afresh" not in task.method.without:
         ways.append(with_causes_afresh)
     jobs = [(way, s) for way in ways for s in starts]
-    results = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
+    results = side_by_side(lambda j: j[0](root, j[1], goal), jobs)
     fitted = [f for f in results if f is not None]
     better = [f for f in fitted if f.names in items and known.scale.evidence(f) > 0.0]
     tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
     task.progress(f"{', '.join('+'.join(sorted(h.names)) for h in best)} to the end")
-    ended = side_by_side(lambda h: to_end(h, task.experiments, goal), best)
+    ended = side_by_side(lambda h: to_end(h, goal), best)
     for f in [*ended, *others]:
         known.note(f)
 
 
 @stage("fits afresh")
-def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
+def fit_from_other_parents(h: Hypothesis, known: Known) -> None:
     """Fit children of a hypothesis from their other parents, where those promise more.
 
     Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
     a child gains what both of its parents have gained over what these share.
     """
-    if "other parents" in task.method.without:
-        return
     evidence = known.scale.evidence
     for cause in h.causes:
         shared = known.found.get(h.names - {cause.name})
@@ -301,5 +293,5 @@ def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
             other = known.found.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
-                task.progress(f"cause {len(child.causes)}: {added} once more")
-                known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
+                known.task.progress(f"cause {len(child.causes)}: {added} once more")
+                known.note(in_place(child, other, other.fit, h.fit, cause))

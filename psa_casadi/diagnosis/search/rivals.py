@@ -10,11 +10,11 @@ def fit_rivals(known: Known) -> None:
 
     By their estimated evidence beside the other causes they are not clearly less likely.
     """
-    best, experiments = known.answer, known.task.experiments
+    best = known.answer
     for cause in best.causes:
         names = best.names - {cause.name}
         if names not in known.found:
-            known.note(without(best, cause, experiments))
+            known.note(without(best, cause))
         less = known.found.get(names)
         if less is None:
             continue
@@ -23,7 +23,7 @@ def fit_rivals(known: Known) -> None:
         near = top - known.task.limits.clearly * temperature(top)
         for name, evidence in view.estimated().items():
             if evidence > near and names | {name} not in known.found:
-                known.note(with_cause(less, experiments, view.starts_of(name)))
+                known.note(with_cause(less, view.starts_of(name)))
         items = [h for h in known.found.values() if h.names > names and len(h.names - names) == 1]
         known.remember(less, *(n for h in items for n in h.names - names))
         open_ones = [h for h in items if not h.final]
