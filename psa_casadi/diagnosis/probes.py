@@ -36,19 +36,11 @@ from psa_casadi.records.drive import tells_tone
 from psa_casadi.records.noise import peaks as highest_peaks
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation import tangent
 from psa_casadi.simulation.exact.run import NotExact, time_steps
 from psa_casadi.simulation.side_by_side import compiled, side_by_side
 from psa_casadi.simulation.simulate import Way, record_inputs
 from psa_casadi.simulation.start import is_stack, memory_names
-from psa_casadi.simulation.tangent import (
-    Answer,
-    Course,
-    Law,
-    answer,
-    course_of,
-    law_of,
-    opened,
-)
 from psa_casadi.units import FloatArray
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
@@ -242,7 +234,7 @@ def laws_of(
     effects: Sequence[Component],
     *,
     finite_steps: bool = True,
-) -> dict[str, Law]:
+) -> dict[str, tangent.Law]:
     """Return the laws of the effects that are not simulated in full, by name.
 
     Of records on even times with straight lines between the samples alone; of effects that are
@@ -253,7 +245,7 @@ def laws_of(
         for r in records:
             time_steps(r.time)
         for e in effects if all(r.hold == "linear" for r in records) else ():
-            law = law_of(model.with_effect(e).structure, e)
+            law = tangent.law_of(model.with_effect(e).structure, e)
             steps = finite_steps and any(e.finite_step)
             if law is not None and (law.forward or not steps):
                 table[e.name] = law
@@ -261,10 +253,10 @@ def laws_of(
 
 
 def screened_with(
-    model: Model, effects: Sequence[Component], laws: Mapping[str, Law]
+    model: Model, effects: Sequence[Component], laws: Mapping[str, tangent.Law]
 ) -> list[Model]:
     """Return the models that a screening simulates, beside the one that it is of."""
-    added = opened(model, laws.values())
+    added = tangent.opened(model, laws.values())
     whole = [model.with_effect(e) for e in effects if e.name not in laws]
     return [added, *whole] if added is not model else whole
 
@@ -273,19 +265,19 @@ class _Beside:
     """What effects add along the course of a fit, those of the `laws` without a model of theirs."""
 
     def __init__(
-        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, Law]
+        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, tangent.Law]
     ) -> None:
-        self.laws, self.opened = laws, opened(fit.model, laws.values())
+        self.laws, self.opened = laws, tangent.opened(fit.model, laws.values())
         self.outputs, starts = outputs_of(experiments[0].channels), fit.starts()
         jacobian = fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
         self.fitted = np.linalg.qr(jacobian)[0]
 
-        def course(k: int) -> Course | None:
+        def course(k: int) -> tangent.Course | None:
             e = experiments[k]
             if not e.stop or not laws:
                 return None
             t, u = e.record.time[: e.stop], record_inputs(fit.model, e.record, e.stop)
-            return course_of(
+            return tangent.course_of(
                 fit.model, t - t[0], u, starts[k],
                 way=fit.way, hold=e.record.hold, outputs=self.outputs,
             )  # fmt: skip
@@ -295,13 +287,13 @@ class _Beside:
     def answer(
         self, model: Model, e: Experiment, k: int, memory: Mapping[str, float], way: Way,
         *, finite: bool,
-    ) -> Answer:  # fmt: skip
+    ) -> tangent.Answer:  # fmt: skip
         """Return what the last effect of a model makes of one record's outputs."""
         course = self.courses[k]
         if course is None:
             raise ValueError("a record that is held out whole has no course")
         law = self.laws[model.components[-1].name]
-        return answer(
+        return tangent.answer(
             self.opened, law, model, course, record_inputs(model, e.record, e.stop), memory,
             finite=finite, way=way, outputs=self.outputs,
         )  # fmt: skip
@@ -430,11 +422,11 @@ def _changes(
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
-    def changed(k: int) -> Answer:
+    def changed(k: int) -> tangent.Answer:
         """Return outputs after the step, or their changes along the derivatives (n, outputs, m)."""
         e, way = experiments[k], Way(rtol, rtol)
         if not e.stop:
-            return Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
+            return tangent.Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
         if others is not None:
             item = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
             return item if step else replace(item, y=item.y * sizes)
@@ -442,7 +434,7 @@ def _changes(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=way, by_start=False, outputs=outputs,
         )  # fmt: skip
-        return Answer(traced.y[:, :, None] if step else traced.sensitivity * sizes, 0.0)
+        return tangent.Answer(traced.y[:, :, None] if step else traced.sensitivity * sizes, 0.0)
 
     outputs = outputs_of(experiments[0].channels)
     every, columns = [changed(k) for k in range(len(experiments))], []

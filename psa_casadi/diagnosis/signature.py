@@ -12,16 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component
-from psa_casadi.diagnosis.views import (
-    Axis,
-    View,
-    axes,
-    drive_of,
-    ground_of,
-    hold_axis,
-    time_axis,
-    view,
-)
+from psa_casadi.diagnosis import views
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
@@ -69,7 +60,7 @@ class Signature:
     voltage: FloatArray
     base: FloatArray
     changed: FloatArray
-    telling: View
+    telling: views.View
     coordinate: FloatArray
     counted: FloatArray
 
@@ -174,7 +165,7 @@ def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
             yield _Play(size, time, voltage, fitted, y, warming)
 
 
-def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArray]:
+def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, FloatArray]:
     """Return the view that says most of the difference, its coordinate, and what it counts."""
     d = play.changed - play.base
     if SPECTRAL_PEAKS in effect.probe.values():
@@ -182,23 +173,23 @@ def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArr
     record = Record(
         name="signature", time=play.time, voltage=play.voltage, displacement=play.changed
     )
-    rows = [time_axis(record), *axes(record, play.base, drive_of(record))]
+    rows = [views.time_axis(record), *views.axes(record, play.base, views.drive_of(record))]
     # two amplitudes at two rates make no curve
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
-        rows = [Axis("temperature", "K", play.warming)]
+        rows = [views.Axis("temperature", "K", play.warming)]
     items = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
-        axis, _ = hold_axis(record)
+        axis, _ = views.hold_axis(record)
         items.append(_view(axis, _since_it_began(axis.x, d)))
 
-    def told(row: tuple[View, FloatArray, FloatArray]) -> float:
+    def told(row: tuple[views.View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
     return max(items, key=told)
 
 
-def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
+def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, FloatArray]:
     """Return the binned means of a difference along an axis, with the share they explain.
 
     No part is left out for judging, as in a measured record: this one has no noise but 2 %, and no
@@ -207,7 +198,7 @@ def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    observed = view(ground_of(residual, noise), axis)
+    observed = views.view(views.ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
@@ -232,7 +223,7 @@ def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
     return moved
 
 
-def _spectrum(time: FloatArray, d: FloatArray) -> View:
+def _spectrum(time: FloatArray, d: FloatArray) -> views.View:
     """Return the amplitude density; its share is that of the band around the highest peak."""
     step = float(time[-1]) / (time.size - 1)
     window = np.hanning(d.size)
@@ -243,7 +234,7 @@ def _spectrum(time: FloatArray, d: FloatArray) -> View:
     share = float(np.sum(power[band]) / np.sum(power))
     displayed = (frequency > 0) & (frequency < 20.0 * peak)
     density: FloatArray = np.sqrt(2.0 * step * power / float(window @ window))
-    return View(
+    return views.View(
         "spectrum",
         "Hz",
         frequency[displayed],

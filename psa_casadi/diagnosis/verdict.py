@@ -12,19 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis import held_out
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import Correction, corrections
-from psa_casadi.diagnosis.held_out import (
-    Share,
-    StackBudget,
-    errors_of,
-    gain_of,
-    held_out_parts,
-    jackknife,
-    lost_elsewhere,
-    stack_budget,
-    whole_residuals,
-)
 from psa_casadi.diagnosis.judgement import Judge, told_from
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
@@ -202,7 +192,7 @@ def diagnosed_model(
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     stiffness_given: bool,
-    spent: StackBudget | None = None,
+    spent: held_out.StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
     result = determinacy(fit, experiments)
@@ -226,16 +216,16 @@ def diagnosed_model(
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:
     """Return the held-out error with the jackknife interval of its logarithm over the parts."""
-    sums, counts = held_out_parts(experiments, predicted)
+    sums, counts = held_out.held_out_parts(experiments, predicted)
     if not len(counts):
         return None
-    errors = errors_of(experiments, predicted)
+    errors = held_out.errors_of(experiments, predicted)
 
     def of(kept: BoolArray) -> float:
         power = float(np.sum(sums[kept])) / max(int(np.sum(counts[kept])), 1)
         return 0.5 * float(np.log(max(power, 1e-300)))
 
-    centre, half = jackknife(of, len(counts))
+    centre, half = held_out.jackknife(of, len(counts))
     records = sum(bool(e.held_out.any()) for e in experiments)
     return HeldOut(
         rms_m=errors.holdout_rms_m,
@@ -246,7 +236,7 @@ def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
     )
 
 
-def _share(s: Share) -> ErrorShare:
+def _share(s: held_out.Share) -> ErrorShare:
     return ErrorShare(s.what, s.share, Interval(*s.interval))
 
 
@@ -259,7 +249,7 @@ class StackJudge(Judge):
         super().__init__(steps, task, driven=driven)
         self.scale_given = scale_given
         self.errors, self.missed_errors = (
-            whole_residuals(self.experiments, s.predicted) for s in (self.last, self.first)
+            held_out.whole_residuals(self.experiments, s.predicted) for s in (self.last, self.first)
         )
         self.floors = noise_floor([e.record for e in self.experiments], self.errors)
         self.floor = pooled_level(self.floors, self.errors, self.last.screening.colour)
@@ -276,9 +266,9 @@ class StackJudge(Judge):
         whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.holdout_rms, 1e-300))
         return unconfirmed(
             experiments,
-            gain_of(experiments, *both),
+            held_out.gain_of(experiments, *both),
             whole=whole,
-            lost=lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
+            lost=held_out.lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
             partly=self.last.test.alarm and len(self.steps) > 1,
             hidden=self.task.hidden,
             limits=self.limits,
@@ -293,10 +283,10 @@ class StackJudge(Judge):
         )
 
     @cached_property
-    def spent(self) -> StackBudget:
+    def spent(self) -> held_out.StackBudget:
         """The error budget in lengths."""
         both = self.first.predicted, self.final.predicted
-        return stack_budget(self.budget, self.experiments, *both, self.floor)
+        return held_out.stack_budget(self.budget, self.experiments, *both, self.floor)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Return the corrections beside a hypothesis, by columns at the stack's ports."""
@@ -325,7 +315,7 @@ class StackJudge(Judge):
         records = [e.record for e in experiments]
         texts = same_curves(experiments, self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
-        base, extended = (errors_of(experiments, p) for p in both)
+        base, extended = (held_out.errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
         output_error = OutputError("displacement", records[0].displacement_unit, self.floor, *rms)
         held = (s.view.of.held[1:] for s in (self.first, final))
@@ -340,7 +330,7 @@ class StackJudge(Judge):
             noise_floor_rms_m=self.floor,
             base_errors=base,
             extended_errors=extended,
-            gain=gain_of(experiments, *both),
+            gain=held_out.gain_of(experiments, *both),
             blind_to=blind_spots(self.steps, final, self.task.table, limits),
             next_experiment=next_experiment(
                 self.causes, self.verdict, texts, records, doubted=self.doubt is not None

@@ -9,34 +9,13 @@ one of them is better; where much is left, from another base and with all effect
 
 import numpy as np
 
-from psa_casadi.diagnosis.base_fit import (
-    SEEN,
-    from_band,
-    from_resonances,
-    instead_of,
-    instead_of_mode,
-    ringing,
-    rings,
-)
+from psa_casadi.diagnosis import base_fit
 from psa_casadi.diagnosis.colour import noise_rms
 from psa_casadi.diagnosis.families import Shown
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.search.fits import (
-    afresh,
-    any_afresh,
-    together,
-    with_cause,
-    without,
-)
+from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names
-from psa_casadi.diagnosis.search.moves import (
-    exchange,
-    fit_from_other_parents,
-    fit_sets,
-    one_mode,
-    with_modes,
-)
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.notes import note
@@ -113,7 +92,7 @@ class _Search:
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
             self.task.progress("all causes to the end")
-            self.known.note(together(best))
+            self.known.note(fits.together(best))
         self.known.conclude()
         if self.left:
             left = tuple(dict.fromkeys(self.left))
@@ -148,7 +127,7 @@ class _Search:
                 return item
         if best.causes and self.once("exchange", best.names):
             if self.does("exchange"):
-                exchange(best, self.known)
+                moves.exchange(best, self.known)
             return self.next()
         if self.known.is_open(best):
             return self.next() if self.otherwise() else self.rejected()
@@ -201,7 +180,7 @@ class _Search:
             less = self.known.found.get(h.names - {cause.name})
             if (less is None or not cause.more_of) and self.does("base again"):
                 self.task.progress(f"without {cause.name}")
-                self.known.note(without(h, cause, less))
+                self.known.note(fits.without(h, cause, less))
         return new
 
     def unseen(self, h: Hypothesis) -> bool:
@@ -246,19 +225,19 @@ class _Search:
         if not names:
             return
         self.tell(h, f"fitting {', '.join(names)}")
-        for result in side_by_side(lambda s: with_cause(h, s), leading[:_PACE]):
+        for result in side_by_side(lambda s: fits.with_cause(h, s), leading[:_PACE]):
             self.known.note(result)
         self.known.remember(h, *names)
         best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
         goal = self.known.near(h, best) if best is not None else np.inf
         rest = leading[_PACE:]
         if rest and self.does("other effects"):
-            for result in side_by_side(lambda s: with_cause(h, s, goal), rest):
+            for result in side_by_side(lambda s: fits.with_cause(h, s, goal), rest):
                 self.known.note(result)
         if "fits afresh" not in self.task.method.without:
             self.fit_afresh(h, view)
             if self.does("other parents"):
-                fit_from_other_parents(h, self.known)
+                moves.fit_from_other_parents(h, self.known)
         leaders = [c for c in self.known.leaders(h) if not c.final]
         self.known.finish(leaders[: FINALISTS if self.does("finalists") else 1])
 
@@ -278,13 +257,13 @@ class _Search:
             return False
         self.shaken[less.names] = less.fit
         self.tell(less, "several modes at once")
-        result = with_modes(less)
+        result = moves.with_modes(less)
         if result is None:
             return False
         self.known.note(result)
         single = view.starts_of(name) if less is h else []
         if single:
-            self.known.note(with_cause(h, single))
+            self.known.note(fits.with_cause(h, single))
         self.known.remember(less, result.causes[-1].name, name)
         return self.known.best().names == result.names
 
@@ -293,7 +272,7 @@ class _Search:
         if self.sets_of is self.known.root or not self.does("several at once"):
             return
         self.sets_of = self.known.root
-        fit_sets(self.known, h)
+        moves.fit_sets(self.known, h)
 
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
@@ -305,7 +284,7 @@ class _Search:
             if best.fit.rms < _SETTLED * floor or not self.does("fits afresh"):
                 break
             self.tell(h, f"{child.causes[-1].name} afresh")
-            self.known.note(afresh(h, child, self.known.near(h, best)))
+            self.known.note(fits.afresh(h, child, self.known.near(h, best)))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:
@@ -314,7 +293,7 @@ class _Search:
         done = [c.causes[-1].name for c in self.known.children(root)[:_AFRESH]]
         scores = [s for n, s in view.screening.best_by_effect().items() if n not in done]
         self.tell(root, "all other effects afresh")
-        result = any_afresh(root, scores)
+        result = fits.any_afresh(root, scores)
         if result is not None:
             self.known.note(result)
             self.known.remember(root, result.causes[-1].name)
@@ -329,16 +308,16 @@ class _Search:
         before = self.known.found.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
-            for one in one_mode(h, before):
+            for one in moves.one_mode(h, before):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)
         if before is None or has_series(h) or not self.does("resonances"):
             return
         last, fit = h.causes[-1], None
-        if rings(last):
-            fit = instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
+        if base_fit.rings(last):
+            fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
         if fit is None and not before.causes and not self.unseen(before):
-            fit = instead_of(before.fit, h.fit, task.experiments, task.progress)
+            fit = base_fit.instead_of(before.fit, h.fit, task.experiments, task.progress)
         self.known.note(hypothesis(before.causes, fit, task.experiments, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
@@ -355,12 +334,12 @@ class _Search:
             return True
         if not self.once("ringing", h.names):
             return False
-        rung = ringing(h.fit, experiments)
-        if rung is None or rung.decrease < SEEN:
+        rung = base_fit.ringing(h.fit, experiments)
+        if rung is None or rung.decrease < base_fit.SEEN:
             return False
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
-        fit = from_band(h.fit, experiments, task.progress)
+        fit = base_fit.from_band(h.fit, experiments, task.progress)
         item = hypothesis(h.causes, fit, experiments, final=True)
         if item is not None and (h.causes or not examine(item, task, self.known.trials).leaves):
             self.known.note(item)
@@ -371,7 +350,7 @@ class _Search:
         root, task = self.known.root, self.task
         if not self.once("resonances", NONE) or not self.does("resonances"):
             return False
-        fitted = from_resonances(root.fit, task.experiments, task.progress)
+        fitted = base_fit.from_resonances(root.fit, task.experiments, task.progress)
         self.known.note(hypothesis((), fitted, task.experiments, final=True))
         return self.known.root is not root
 

@@ -7,18 +7,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
-from psa_casadi.diagnosis.search.fits import (
-    Start,
-    cost_beside,
-    exchanged,
-    fit_with_all,
-    in_place,
-    like,
-    to_end,
-    with_cause,
-    with_causes,
-    with_causes_afresh,
-)
+from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
@@ -78,7 +67,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             for name, value in asdict(mode).items()
         }
         added = [(effect, values, 1.0)]
-        result = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        result = fits.fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
         if result is None:
             return None
         ringing = [m for m in _modes(result, len(modes)) if m.damping < MOST_DAMPED]
@@ -99,16 +88,16 @@ def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     fit = series.fit
     states = tuple(fit.starts())
     low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
-    starts: list[Start] = []
+    starts: list[fits.Start] = []
     for mode in _modes(fit, series.causes[-1].count):
         lead = float(np.clip(mode.ahead / (mode.share or 1e-300), low, high))
         form = {
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    results = side_by_side(lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
+    results = side_by_side(lambda s: fits.exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
     best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
-    return side_by_side(to_end, best)
+    return side_by_side(fits.to_end, best)
 
 
 def _even(time: FloatArray) -> bool:
@@ -161,7 +150,7 @@ def exchange(h: Hypothesis, known: Known) -> None:
         for copy in _copies(h, less, known):
             name = copy.direction.effect.name
             known.task.progress(f"{name}, which could copy {cause.name}")
-            known.note(like(h, less, copy, known.near(less, h)))
+            known.note(fits.like(h, less, copy, known.near(less, h)))
             known.remember(less, name)
 
 
@@ -188,12 +177,12 @@ def _put_in_place(h: Hypothesis, less: Hypothesis, starts: Sequence[Score], know
     To the end where that comes near.
     """
     goal = known.near(less, h)
-    rival = with_cause(less, starts, goal)
+    rival = fits.with_cause(less, starts, goal)
     known.note(rival)
     if rival is None:
         return
     effect = _effect(starts)
-    known.note(in_place(h, less, h.fit, rival.fit, effect, goal))
+    known.note(fits.in_place(h, less, h.fit, rival.fit, effect, goal))
     known.remember(less, effect.name)
     best = known.found.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
@@ -259,10 +248,10 @@ def fit_sets(known: Known, h: Hypothesis) -> None:
     starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes: fitting {text}")
-    goal = cost_beside(known.best(), root)
-    ways = [with_causes]
+    goal = fits.cost_beside(known.best(), root)
+    ways = [fits.with_causes]
     if "fits afresh" not in task.method.without:
-        ways.append(with_causes_afresh)
+        ways.append(fits.with_causes_afresh)
     jobs = [(way, s) for way in ways for s in starts]
     results = side_by_side(lambda j: j[0](root, j[1], goal), jobs)
     fitted = [f for f in results if f is not None]
@@ -271,7 +260,7 @@ def fit_sets(known: Known, h: Hypothesis) -> None:
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
     task.progress(f"{', '.join('+'.join(sorted(h.names)) for h in best)} to the end")
-    ended = side_by_side(lambda h: to_end(h, goal), best)
+    ended = side_by_side(lambda h: fits.to_end(h, goal), best)
     for f in [*ended, *others]:
         known.note(f)
 
@@ -294,4 +283,4 @@ def fit_from_other_parents(h: Hypothesis, known: Known) -> None:
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
                 known.task.progress(f"cause {len(child.causes)}: {added} once more")
-                known.note(in_place(child, other, other.fit, h.fit, cause))
+                known.note(fits.in_place(child, other, other.fit, h.fit, cause))
