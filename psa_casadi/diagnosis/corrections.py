@@ -20,6 +20,7 @@ Stops and plays: Visintin 1994; their squares and cubes make loops that are asym
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -30,9 +31,10 @@ from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
 from psa_casadi.diagnosis.screening import independent, temperature, without
 from psa_casadi.diagnosis.task import LIMITS, Thresholds, shows_ringing
-from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
-from psa_casadi.errors import PsaError
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.effects import patches
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.refitting import POLISH
 from psa_casadi.identification.start.linear_response import plays
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -40,6 +42,7 @@ from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import linear_part
+from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
 #: Relaxations per decade, modes.
@@ -94,13 +97,13 @@ def _cosines(q: FloatArray, first: int, count: int) -> FloatArray:
 
 def _direction(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
-    side = (q[:, None] - plays(q, [NARROW])) / NARROW
-    return s.respond(k, side * _cosines(q, 0, BRANCH))
+    side = (q[:, None] - plays(q, [patches.NARROW])) / patches.NARROW
+    return s.respond(k, side * _cosines(q, 0, patches.BRANCH))
 
 
 def _memory(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
-    radii = np.array([radius(k) for k in range(ELEMENTS)])
+    radii = np.array([patches.radius(k) for k in range(patches.ELEMENTS)])
     followed = plays(q, radii)
     return s.respond(k, np.hstack([q[:, None] - followed, followed**2, followed**3]))
 
@@ -137,7 +140,7 @@ def _modes(s: Signals, k: int) -> FloatArray:
 
 def _time(s: Signals, k: int) -> FloatArray:
     t = s.experiments[k].record.time
-    return _cosines((t - t[0]) / (t[-1] - t[0]), 1, BRANCH)
+    return _cosines((t - t[0]) / (t[-1] - t[0]), 1, patches.BRANCH)
 
 
 def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
@@ -166,10 +169,10 @@ def _smooth(count: int) -> FloatArray:
 
 KINDS = (
     Kind("curve", "drive voltage",
-         lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, CURVE)), _smooth),
-    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, CURVE), _smooth),
+         lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, patches.CURVE)), _smooth),
+    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, patches.CURVE), _smooth),
     Kind("curve", "force",
-         lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, CURVE)), _smooth, fast=True),
+         lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, patches.CURVE)), _smooth, True),
     Kind("direction", "force", _direction, _smooth),
     Kind("memory", "force", _memory, _flat),
     Kind("relaxation", "force", _relaxation, _flat),
@@ -470,3 +473,66 @@ def responses(
         return np.asarray(out[pad : pad + n])
 
     return respond
+
+
+def with_patch(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Fit:
+    """Return a fit with the correction beside the model, begun with the weights that it has.
+
+    The model's own values begin where they follow the correction, and where they were.
+
+    `predicted` [m] are the predictions of `before`. Raises InputError for a kind that no component
+    stands for, SimulationError where it cannot be simulated.
+    """
+    component = patches.PATCHES.get((patch.kind, patch.port))
+    if component is None:
+        raise InputError(
+            f"The unnamed correction ({patch.name}) has no form that a model could hold; the page"
+            " shows it, and a further mode of the table is the nearest that can be fitted."
+        )
+    numbers = _numbers(before, patch, experiments, predicted)
+    names = [patches.weight(k + 1) for k in range(len(patch.weights))]
+    values = {**numbers, patches.GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
+
+    def begun(theta: FloatArray) -> Fit:
+        unknowns = before.unknowns
+        return fit(
+            before.model.with_effect(component, {**values, **unknowns.values(theta)}),
+            experiments,
+            [*unknowns.names, *names],
+            sigma=before.sigma,
+            start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
+            evaluations=POLISH,
+        )
+
+    items = []
+    for theta in (before.theta + patch.moved, before.theta):
+        with suppress(SimulationError):
+            items.append(begun(theta))
+    if not items:
+        raise SimulationError("The model cannot be simulated with the unnamed correction.")
+    return min(items, key=lambda f: f.cost)
+
+
+def _numbers(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Mapping[str, float]:
+    """Return the parameters that are not fitted: the range, times."""
+    records = [e.record for e in experiments]
+    longest = max(r.duration for r in records)
+    if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
+        every = np.concatenate([r.voltage for r in records])
+    else:
+        every = np.concatenate([y - before.offset(k) for k, y in enumerate(predicted)])
+    numbers = {"patch_low": float(np.min(every)), "patch_high": float(np.max(every))}
+    if patch.kind == "time":
+        return {"patch_time": longest}
+    if patch.kind == "gain in time":
+        return {**numbers, "patch_time": longest}
+    if patch.kind == "relaxation":
+        taus = time_constants(records)
+        if len(taus) > patches.RELAXATIONS:
+            raise InputError("The records span more decades of time than a correction can hold.")
+        return {**numbers, "patch_time": float(taus[0]), "patch_ratio": float(taus[1] / taus[0])}
+    return numbers

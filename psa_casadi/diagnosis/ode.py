@@ -19,7 +19,7 @@ from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.search.rivals import fit_rivals
+from psa_casadi.diagnosis.search.moves import fit_rivals
 from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.experiments import (

@@ -14,12 +14,11 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis import held_out
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
-from psa_casadi.diagnosis.corrections import Correction, corrections
+from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
 from psa_casadi.diagnosis.judgement import Judge, told_from
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.patch import with_patch
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
     Alternative,

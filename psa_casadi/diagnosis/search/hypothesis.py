@@ -23,10 +23,12 @@ import scipy
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
+from psa_casadi.diagnosis.noise import known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus
 from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
+from psa_casadi.diagnosis.process_noise import entering
 from psa_casadi.diagnosis.screening import (
     Score,
     Screening,
@@ -187,8 +189,14 @@ def hypothesis(
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     """Return a hypothesis with noise that enters its model, if that is likelier."""
-    item = task.pack.entering(of.fit, of.experiments, of.shown, of.own)
-    return replace(of, own=item)
+    if task.pack.is_stack:
+        return of  # noise of any colour is the sensor's
+    own = []
+    for k, (f, colour) in enumerate(zip(of.fit.channels, of.own, strict=True)):
+        pairs = zip(of.experiments, of.shown, strict=True)
+        errors = [e.errors(f.number, y[:, k]) for e, y in pairs]
+        own.append(entering(of.fit, of.experiments, errors, k, colour))
+    return replace(of, own=tuple(own))
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
@@ -360,7 +368,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
         colour = replace(colour, further=tuple(others))
     test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=item)
     coloured = item and any(c.autoregression.size for c in of.own)
-    if coloured and kept and task.pack.asks_effects and not test.alarm:
+    if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
 
@@ -384,10 +392,13 @@ def _asked(
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
-    lengths = [int(e.at(0).sum()) for e in task.experiments]
-    known, colour = task.pack.colours(fit, task.experiments), None
+    experiments, known, colour = task.experiments, None, None
+    lengths = [int(e.at(0).sum()) for e in experiments]
     if "remainder" in task.method.without:
-        known, colour = None, residual_colour(fit.residuals, lengths)
+        colour = residual_colour(fit.residuals, lengths)
+    elif task.pack.is_stack:
+        pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+        known = [known_colour(e.record, r) for e, r in pairs]
     return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.pack import Task
+from psa_casadi.diagnosis.pack import Task, is_dynamic
 from psa_casadi.diagnosis.search.fits import as_led, begun_again, cost_beside, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
@@ -22,6 +22,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
 )
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.refitting import relevelled
 from psa_casadi.notes import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 
@@ -211,7 +212,9 @@ class Known:
     def _to_end(self, h: Hypothesis) -> Hypothesis:
         """Fit a hypothesis to its end, with the noise that it leaves."""
         ended = to_end(h)
-        levelled = self.task.pack.ended(ended.fit, h.experiments)
+        if self.task.pack.is_stack:
+            return ended
+        levelled, _ = relevelled(ended.fit, h.experiments, every=True)
         if levelled is ended.fit:
             return ended
         return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
@@ -285,13 +288,13 @@ class Known:
 
     def remembers(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
         """Whether a cause with a memory that stays adds more than a static curve."""
-        if not any(s.memory and not s.settles for s in cause.states):
+        stays = any(s.memory and not s.settles for s in cause.states)
+        if not (stays and self.task.pack.is_stack):
             return True
         if (h, before) not in self.memories:
             added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
-            self.memories[h, before] = self.task.pack.remembers(
-                added, before.fit, h.experiments, self.task.limits
-            )
+            dynamic = is_dynamic(added, before.fit, h.experiments, self.task.limits)
+            self.memories[h, before] = dynamic
         return self.memories[h, before]
 
     def gained(self, before: Hypothesis, after: Hypothesis) -> bool:

@@ -1,4 +1,4 @@
-"""Moves of the search beside one effect more: modes, exchanges, several at once."""
+"""Moves of the search beside one effect more: modes, exchanges, several at once, rivals."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
+from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies, temperature
 from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
@@ -284,3 +284,29 @@ def fit_from_other_parents(h: Hypothesis, known: Known) -> None:
                 added = child.causes[-1].name
                 known.task.progress(f"cause {len(child.causes)}: {added} once more")
                 known.note(fits.in_place(child, other, other.fit, h.fit, cause))
+
+
+def fit_rivals(known: Known) -> None:
+    """Fit to their end the effects that may be in the place of each cause of the answer.
+
+    By their estimated evidence beside the other causes they are not clearly less likely.
+    """
+    best = known.answer
+    for cause in best.causes:
+        names = best.names - {cause.name}
+        if names not in known.found:
+            known.note(fits.without(best, cause))
+        less = known.found.get(names)
+        if less is None:
+            continue
+        view, item = known.view(less), known.scale.evidence(less)
+        top = known.scale.evidence(best) - item
+        near = top - known.task.limits.clearly * temperature(top)
+        for name, evidence in view.estimated().items():
+            if evidence > near and names | {name} not in known.found:
+                known.note(fits.with_cause(less, view.starts_of(name)))
+        items = [h for h in known.found.values() if h.names > names and len(h.names - names) == 1]
+        known.remember(less, *(n for h in items for n in h.names - names))
+        open_ones = [h for h in items if not h.final]
+        known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
+    known.worthy = frozenset(n for n, h in known.found.items() if known.worth(h))
