@@ -262,7 +262,7 @@ class StackJudge(Judge):
     def doubt(self) -> Note | None:
         """Why the records do not confirm the causes."""
         experiments, both = self.experiments, (self.first.predicted, self.last.predicted)
-        whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.holdout_rms, 1e-300))
+        whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.held[0], 1e-300))
         return unconfirmed(
             experiments,
             held_out.gain_of(experiments, *both),

@@ -50,7 +50,7 @@ def best_first(base: Fit, task: Task, before: Known | None = None) -> Known:
         try:
             search.run()
         except KeyboardInterrupt:
-            task.keep(search.known.so_far().fit)
+            task.keep(next(h for h in search.known.ranked() if h.final).fit)
             raise
     return search.known
 
@@ -118,13 +118,9 @@ class _Search:
             return self.next()
         best = self.known.best()
         way = [self.known.found.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
-        for item in way:
-            if (
-                item is not None
-                and (item is best or item.names in self.expanded)
-                and self.unseen(item)
-            ):
-                return item
+        for h in way:
+            if h and (h is best or h.names in self.expanded) and self.unseen(h):
+                return h
         if best.causes and self.once("exchange", best.names):
             if self.does("exchange"):
                 moves.exchange(best, self.known)
@@ -138,8 +134,8 @@ class _Search:
 
     def is_small(self, h: Hypothesis) -> bool:
         """Whether causes are so small beside the noise that others may be as likely."""
-        displayed = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
-        return bool(h.causes) and displayed.known(self.task.limits) < _SURELY
+        shown = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
+        return bool(h.causes) and shown.known(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
@@ -188,7 +184,10 @@ class _Search:
         last = self.expanded.get(h.names)
         if last is None or h.fit.rms < _BETTER * last.fit.rms:
             return True
-        return h is self.known.best() and self.known.gained(last, h)
+        if h is not self.known.best():
+            return False
+        scale = self.known.scale
+        return scale.evidence(h) > scale.evidence(last) + scale.limits.price
 
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""

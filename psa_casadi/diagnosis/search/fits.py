@@ -17,6 +17,7 @@ from psa_casadi.identification.start.ordinary import has_loop, ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import is_stack
+from psa_casadi.variables import Parameter
 
 #: Evaluations of a quick fit from a direction; with what it held, free again.
 QUICK, _FREED = 8, 3
@@ -44,8 +45,8 @@ def quick_fit(
     for values, gain, memory in starts:
         least = min([goal, before.cost, *(f.cost for f in fits)])
         added = [(effect, values, gain)]
-        item = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
-        fits += [item] if item is not None else []
+        quick = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
+        fits += [quick] if quick is not None else []
     if not any(f.cost < before.cost for f in fits):
         nested, states = [(effect, starts[0][0], 0.0)], tuple(before.starts())
         last = fit_with_all(before, experiments, nested, states, {}, 3 * QUICK, goal)
@@ -75,12 +76,11 @@ def fit_with_all(
         model = before.model
         try:
             for effect, values, gain in added:
-                low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
-                moved = effect.linear or effect.gain in effect.fitted
-                item = share * gain if moved else gain
+                low, high = _parameter(effect, effect.gain).bounds
+                size = share * gain if effect.linear or effect.gain in effect.fitted else gain
                 if not effect.linear:
-                    item = float(np.clip(item, 0.9 * low, 0.9 * high))
-                model = model.with_effect(effect, {**effect.at_gain(item, values), **reset})
+                    size = float(np.clip(size, 0.9 * low, 0.9 * high))
+                model = model.with_effect(effect, {**effect.at_gain(size, values), **reset})
             result = fit(
                 model,
                 weighted(before, experiments),
@@ -197,12 +197,11 @@ def with_causes_afresh(
     added = []
     for d, gain in zip(start.directions, start.gains, strict=True):
         linear = d.effect.linear  # the side to which the declared weights move with it
-        side = sum(_declared(d.effect, n) * d.values[n] for n in linear) if linear else 1.0
+        side = sum(_parameter(d.effect, n).value * d.values[n] for n in linear) if linear else 1.0
         size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), side * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
-    ordinary = _ordinary_base(before.fit, before.experiments)
-    states = _states(before.fit, ordinary)
+    ordinary, states = _ordinary_base(before.fit, before.experiments)
     quick = fit_with_all(before.fit, before.experiments, added, states, ordinary, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
 
@@ -376,7 +375,7 @@ def begun_again(of: Hypothesis) -> Hypothesis | None:
     if at_end is None:
         return None
     kept = {at_end.gain, *at_end.linear}
-    table = {n: _declared(at_end, n) for n in at_end.fitted if n not in kept}
+    table = {n: _parameter(at_end, n).value for n in at_end.fitted if n not in kept}
     gains = at_end.linear or (at_end.gain or "",)
 
     def begin(share: float) -> Fit | None:
@@ -401,8 +400,7 @@ def _from_ordinary(
     known: Mapping[str, float],
 ) -> list[Fit]:
     """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
-    gain = next(p for p in effect.parameters if p.name == effect.gain)
-    size = _typical(before, effect)
+    gain, size = _parameter(effect, effect.gain), _typical(before, effect)
     sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
@@ -410,30 +408,28 @@ def _from_ordinary(
     loops = (False, True) if has_loop(before.model) else (False,)
     bases = [_ordinary_base(before, experiments, soon=soon) for soon in loops]
 
-    def begun(start: tuple[dict[str, float], float]) -> Fit | None:
-        ordinary, share = start
-        added, states = [(effect, values, share * size)], _states(before, ordinary)
+    def start(base: tuple[_Base, float]) -> Fit | None:
+        (ordinary, states), share = base
+        added = [(effect, values, share * size)]
         return fit_with_all(before, experiments, added, states, ordinary, QUICK)
 
     starts = list(itertools.product(bases, sizes))
-    return [f for f in side_by_side(begun, starts) if f is not None]
+    return [f for f in side_by_side(start, starts) if f is not None]
 
 
-def _ordinary_base(
-    before: Fit, experiments: Sequence[Experiment], *, soon: bool = False
-) -> dict[str, float]:
-    """Return the values of an ordinary stack; any other model goes on from its own."""
-    if not is_stack(before.model):
-        return {}
-    return ordinary_values(before.model, [e.record for e in fitted(experiments)], soon=soon)
+#: Values of a base, and the states in which records begin.
+_Base = tuple[dict[str, float], tuple[dict[str, float], ...]]
 
 
-def _states(before: Fit, ordinary: Mapping[str, float]) -> tuple[dict[str, float], ...]:
-    """Return the states in which records begin; of an ordinary stack they are at rest.
+def _ordinary_base(before: Fit, experiments: Sequence[Experiment], *, soon: bool = False) -> _Base:
+    """Return an ordinary stack at rest; any other model goes on from its own values and states.
 
-    Those of a loop that is bent would bend the ordinary one.
+    The states of a loop that is bent would bend the ordinary one.
     """
-    return () if ordinary else tuple(before.starts())
+    if not is_stack(before.model):
+        return {}, tuple(before.starts())
+    records = [e.record for e in fitted(experiments)]
+    return ordinary_values(before.model, records, soon=soon), ()
 
 
 def _best_continued(
@@ -454,17 +450,17 @@ def _best_continued(
 
 def _typical(before: Fit, effect: Component) -> float:
     """Return an ordinary size of an effect's gain beside a fit."""
-    gain = next(p for p in effect.parameters if p.name == effect.gain)
+    gain = _parameter(effect, effect.gain)
     return gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
 
 
 def _ordinary_form(effect: Component, known: Mapping[str, float]) -> dict[str, float]:
     """Return an effect's declared values where it has trials; forms and frequencies are `known`."""
     return {
-        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
-        for n, grid in effect.probe.items()
+        n: known[n] if isinstance(g, str) or n not in effect.fitted else _parameter(effect, n).value
+        for n, g in effect.probe.items()
     }
 
 
-def _declared(effect: Component, name: str) -> float:
-    return next(p.value for p in effect.parameters if p.name == name)
+def _parameter(effect: Component, name: str | None) -> Parameter:
+    return next(p for p in effect.parameters if p.name == name)

@@ -95,11 +95,6 @@ class Hypothesis:
         return gained + max(ahead - chance, 0.0) - spent
 
     @property
-    def holdout_rms(self) -> float:
-        """The error of the first channel in held-out samples."""
-        return self.held[0]
-
-    @property
     def errors(self) -> tuple[float, ...]:
         """The held-out rms of every channel, that of fitted samples where none is held out."""
         return tuple(held or train for held, train in zip(self.held, self.train, strict=True))
@@ -297,8 +292,8 @@ class View:
         further start differs from the best one in as many trial values as it can. One that is
         looked for with both signs of its gain begins at each of these steps, too.
         """
-        items = [s for s in self.screening.scores if s.direction.effect.name == name]
-        near = [s for s in items if s.decrease >= 0.3 * items[0].decrease]
+        scores = [s for s in self.screening.scores if s.direction.effect.name == name]
+        near = [s for s in scores if s.decrease >= 0.3 * scores[0].decrease]
         starts: list[Score] = []
 
         def form(score: Score) -> dict[str, float]:
@@ -317,8 +312,8 @@ class View:
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
                 starts.append(score)
-        both = min(items[0].direction.effect.finite_step, default=0.0) < 0.0
-        return starts + [s for s in items if both and s.direction.finite and s not in starts]
+        both = min(scores[0].direction.effect.finite_step, default=0.0) < 0.0
+        return starts + [s for s in scores if both and s.direction.finite and s not in starts]
 
     @property
     def promise(self) -> float:
@@ -331,9 +326,9 @@ class View:
 
         Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
         """
-        observed = self.decrease >= self.screening.threshold
-        observed = observed and self.pack.shows(self.of.fit, self.promise, self.test)
-        return observed and (self.test.alarm or not self.of.causes)
+        fit, asked = self.of.fit, self.test.alarm or not self.of.causes
+        significant = self.decrease >= self.screening.threshold
+        return significant and self.pack.shows(fit, self.promise, self.test) and asked
 
     @property
     def leaves(self) -> bool:
@@ -361,13 +356,13 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    residuals, colour, item = [f.residuals for f in fit.channels], screening.colour, False
-    if not of.causes:  # is there anything but noise of some colour?
-        item, tested = True, [c.tested for c in of.own]
+    residuals, colour, alone = [f.residuals for f in fit.channels], screening.colour, not of.causes
+    if alone:  # is there anything but noise of some colour?
+        tested = [c.tested for c in of.own]
         residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
         colour = replace(colour, further=tuple(others))
-    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=item)
-    coloured = item and any(c.autoregression.size for c in of.own)
+    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=alone)
+    coloured = alone and any(c.autoregression.size for c in of.own)
     if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
@@ -402,8 +397,6 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
 
 
-#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
-_SAME = 1.0
 #: Share of a range that is near its end.
 _END = 0.1
 
@@ -439,14 +432,6 @@ def confirmed(gained: float, promise: float, score: float, limits: Thresholds = 
     """
     least = min(limits.held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
     return bool(gained > least and score + gained > limits.held_out)
-
-
-def another_minimum(gained: float, held_out: float) -> bool:
-    """Whether a fit of the same causes is another minimum that takes the other one's place.
-
-    It has `gained` more evidence, and held-out samples do not object by more than that [nats].
-    """
-    return gained > _SAME and gained + held_out > 0.0
 
 
 def near_end(values: Mapping[str, float], effect: Component) -> bool:

@@ -12,7 +12,6 @@ from psa_casadi.diagnosis.search.fits import as_led, begun_again, cost_beside, t
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
-    another_minimum,
     examine,
     held_out_confirms,
     hypothesis,
@@ -31,6 +30,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 SHARE, NEAR = 0.8, 30.0
 #: So many fits of neighbours go to their end.
 FINALISTS = 3
+#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
+_SAME = 1.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -57,8 +58,9 @@ class Known:
         root = root_of(base, task)
         first = examine(root, task)
         self.trials = first.trials
-        item = scale_of(root, first.screening.colour, task.limits)
-        self.scale = replace(item, held=()) if "held out" in task.method.without else item
+        self.scale = scale_of(root, first.screening.colour, task.limits)
+        if "held out" in task.method.without:
+            self.scale = replace(self.scale, held=())
         self.found: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
@@ -92,8 +94,8 @@ class Known:
             names = frozenset(c.name for c in causes)
             known = [self.found.get(names | {c.name}) for c in left]
             gains = [-np.inf if k is None else self.scale.evidence(k) for k in known]
-            items = [c.name not in shared for c in left]
-            causes.append(left.pop(max(range(len(left)), key=lambda k: (items[k], gains[k]))))
+            ranks = [(c.name not in shared, g) for c, g in zip(left, gains, strict=True)]
+            causes.append(left.pop(ranks.index(max(ranks))))
         self.found[h.names] = ordered = replace(h, causes=tuple(causes))
         return ordered
 
@@ -104,17 +106,14 @@ class Known:
         """
         if found is None:
             return
-        old = self.found.get(found.names)
-        if old is None or self.replaces(found, old):
+        old, evidence = self.found.get(found.names), self.scale.evidence
+        gained = np.inf if old is None else evidence(found) - evidence(old)
+        ahead = 0.0 if old is None else self.scale.held_out(found, old)
+        if gained > _SAME and gained + ahead > 0.0:
             causes = found.causes if old is None else old.causes
             kept = replace(found, causes=causes)
             self.found[found.names] = kept if causes else noisy(kept, self.task)
             self.tell(kept, "finished" if kept.final else "fitted")
-
-    def replaces(self, result: Hypothesis, old: Hypothesis) -> bool:
-        """Whether a fit of the same causes takes another one's place."""
-        gained = self.scale.evidence(result) - self.scale.evidence(old)
-        return another_minimum(gained, self.scale.held_out(result, old))
 
     def tell(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
@@ -125,8 +124,8 @@ class Known:
                 evidence=float(self.scale.evidence(h)),
                 score=float(self.scale.score(h)),
                 rms_m=float(h.fit.rms),
-                holdout_rms_m=float(h.holdout_rms),
-                base_rms_m=float(self.root.holdout_rms),
+                holdout_rms_m=float(h.held[0]),
+                base_rms_m=float(self.root.held[0]),
                 noise_rms_m=float(self.scale.colour.rms),
             )
         )
@@ -143,18 +142,17 @@ class Known:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted beside one, best first."""
-        items = [self.found.get(h.names | {n}) for n in self.fitted.get(h.names, ())]
-        item = []
-        for child in items:
-            if child is not None:
+        children = []
+        for name in self.fitted.get(h.names, ()):
+            if (child := self.found.get(h.names | {name})) is not None:
                 added = [c for c in child.causes if c.name not in h.names]
-                item.append(replace(child, causes=(*h.causes, *added)))
-        return sorted(item, key=lambda c: -self.scale.evidence(c))
+                children.append(replace(child, causes=(*h.causes, *added)))
+        return sorted(children, key=lambda c: -self.scale.evidence(c))
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
-        item, children = self.scale.evidence(h), self.children(h)
-        gains = [self.scale.evidence(c) - item for c in children]
+        evidence, children = self.scale.evidence(h), self.children(h)
+        gains = [self.scale.evidence(c) - evidence for c in children]
         least = nearly(gains[0]) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
@@ -188,10 +186,6 @@ class Known:
         best, fitted = self.best(), self.scale.of_fitted
         better = [h for h in self.ranked() if fitted(h) > fitted(best)]
         return [h for h in better if self.worth(h, confirmed=False)]
-
-    def so_far(self) -> Hypothesis:
-        """Return the best of what was fitted to its end, whether worth having or not."""
-        return next(h for h in self.ranked() if h.final)
 
     def finish(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Fit hypotheses to their end."""
@@ -296,10 +290,6 @@ class Known:
             dynamic = is_dynamic(added, before.fit, h.experiments, self.task.limits)
             self.memories[h, before] = dynamic
         return self.memories[h, before]
-
-    def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
-        """Whether a fit has more evidence than an earlier one by the price of a cause."""
-        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.limits.price
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
         """Whether an effect is none of the causes, nor bends the same curve as one of them."""
