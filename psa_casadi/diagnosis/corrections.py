@@ -86,8 +86,7 @@ class Kind:
 
 
 def _over_range(values: FloatArray, every: Sequence[FloatArray]) -> FloatArray:
-    low = min(float(np.min(v)) for v in every)
-    high = max(float(np.max(v)) for v in every)
+    low, high = min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every)
     return (values - low) / max(high - low, 1e-300)
 
 
@@ -327,15 +326,14 @@ def best_of(
     """
     samples = [sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in range(len(held))]
 
-    def gained(c: Correction) -> float:
-        rows = zip(samples, colour.each, held, c.held, strict=False)
-        return sum(
-            n / item.inflation * float(np.log(before / max(after, 1e-300)))
-            for n, item, before, after in rows
-        )
+    counts = [n / c.inflation for n, c in zip(samples, colour.each, strict=False)]
 
-    items = [c for c in result if c.evidence > limits.price]
-    good = [c for c in items if not any(samples) or gained(c) > limits.held_out]
+    def gained(c: Correction) -> float:
+        rows = zip(counts, held, c.held, strict=False)
+        return sum(n * float(np.log(before / max(after, 1e-300))) for n, before, after in rows)
+
+    likely = [c for c in result if c.evidence > limits.price]
+    good = [c for c in likely if not any(samples) or gained(c) > limits.held_out]
     if not good:
         return None
     best = max(good, key=lambda c: c.evidence)
@@ -434,9 +432,8 @@ def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float
         ratio = (size / largest) ** 2 * n
         shrunk = ratio * singular**2 / (1.0 + ratio * singular**2)
         left = power - float(np.sum(shrunk * along**2))
-        log_ratio = -0.5 * n * np.log(left / power) - 0.5 * float(
-            np.sum(np.log1p(ratio * singular**2))
-        )
+        spent = 0.5 * float(np.sum(np.log1p(ratio * singular**2)))
+        log_ratio = -0.5 * n * np.log(left / power) - spent
         if log_ratio > best[0]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 scaled = np.where(singular > 1e-12 * largest, shrunk / singular, 0.0) * along
