@@ -71,8 +71,7 @@ class Colour:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
         if not signal.size or (self.spread is None and not any(map(len, self.autoregression))):
             return signal
-        white = signal.copy()
-        first = 0
+        white, first = signal.copy(), 0
         records = zip(self.autoregression, self._powers, self.lengths, strict=True)
         for a, power, length in records:
             part = signal[first : first + length]
@@ -92,11 +91,9 @@ class Colour:
         """
         if not further:
             return self.whiten(signal)
-        items = [
-            self.level / item.level * item.whiten(part)
-            for item, part in zip(self.further, further, strict=True)
-        ]
-        return np.concatenate([self.whiten(signal), *items])
+        pairs = zip(self.further, further, strict=True)
+        others = [self.level / c.level * c.whiten(part) for c, part in pairs]
+        return np.concatenate([self.whiten(signal), *others])
 
 
 def colour_of(
@@ -184,9 +181,8 @@ def _before(value: float, removed: Sequence[FloatArray]) -> float:
             break
         item.append(r)
         left.append(more)
-    return (
-        float(np.interp(value, left, item)) + min(0.0, value - left[0]) + max(0.0, value - left[-1])
-    )
+    beyond = min(0.0, value - left[0]), max(0.0, value - left[-1])
+    return float(np.interp(value, left, item)) + beyond[0] + beyond[1]
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:

@@ -37,20 +37,14 @@ def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, IndexArray]:
     output is not judged. The parts are the records that have any, where there are at least four,
     else eight blocks of each.
     """
-    rows = [item for item in zip(*errors, strict=True) if len(item[0])]
+    rows = [row for row in zip(*errors, strict=True) if len(row[0])]
     if len(rows) < FEWEST_RECORDS:
-        rows = [
-            block
-            for item in rows
-            for block in zip(*(np.array_split(e, _BLOCKS) for e in item), strict=True)
-            if len(block[0])
-        ]
+        blocks = [zip(*(np.array_split(e, _BLOCKS) for e in r), strict=True) for r in rows]
+        rows = [block for of_one in blocks for block in of_one if len(block[0])]
     outputs = errors[0][0].shape[1]
     judged = [~np.isnan(np.array(row)).all(axis=0) for row in rows]
-    sums = [
-        [np.sum(e**2, axis=0, where=there) for e in row]
-        for row, there in zip(rows, judged, strict=True)
-    ]
+    pairs = zip(rows, judged, strict=True)
+    sums = [[np.sum(e**2, axis=0, where=there) for e in row] for row, there in pairs]
     counts = np.array([there.sum(axis=0) for there in judged], dtype=np.int64)
     return np.reshape(sums, (-1, len(errors), outputs)), counts.reshape(-1, outputs)
 
@@ -382,9 +376,7 @@ def stack_budget(
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     whole = errors_of(experiments, extended)
     return StackBudget(
-        result.together,
-        result.causes,
-        result.unnamed,
+        **vars(result),
         excess_rms_m=excess,
         noise_rms_m=noise,
         remains_rms_m=remains,
