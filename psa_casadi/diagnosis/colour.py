@@ -28,7 +28,7 @@ class Colour:
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
     records' numbers of samples. `further` are the colours of the columns beside the displacement,
     each with a level in its own unit. The first samples of a record count over the noise's rms, or
-    with 0 where a record does not say how it `begins`; every sample over its `spread` (samples,),
+    with 0 where a record has no `known_start`; every sample over its `spread` (samples,),
     where the noise is not as large everywhere.
     """
 
@@ -36,7 +36,7 @@ class Colour:
     level: float
     lengths: tuple[int, ...]
     further: tuple["Colour", ...] = ()
-    begins: bool = True
+    known_start: bool = True
     spread: FloatArray | None = None
 
     @property
@@ -78,7 +78,7 @@ class Colour:
             if a.size and length > a.size:
                 item = white[first : first + length]
                 item[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                item[: a.size] = self.begins * part[: a.size] / np.sqrt(power)
+                item[: a.size] = self.known_start * part[: a.size] / np.sqrt(power)
             first += length
         if self.spread is not None:
             white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))

@@ -232,10 +232,10 @@ class Correction:
     @property
     def sentence(self) -> str:
         """What it is in words."""
-        return str(self.said)
+        return str(self.label)
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         raise NotImplementedError
 
@@ -259,7 +259,7 @@ class Patch(Correction):
         return f"{self.kind} at the {self.port}"
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         return note("correction", kind=self.kind, port=self.port)
 
@@ -301,7 +301,7 @@ class FreeFunction(Correction):
         return f"a free function of {self.of} in {self.port}"
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         return note("free", of=self.of, port=self.port, equation=self.equation)
 
@@ -375,13 +375,13 @@ class _Following:
         scaled = used[:, self.free] * self.prior
         self.white = np.vstack([self.over_noise(scaled), self.held])
         self.basis = independent(self.white)
-        self.target = self.beside(fit.residuals)
+        self.target = self.orthogonal(fit.residuals)
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns at the used samples, whitened, over the noise."""
         return self.colour.whiten(columns) / self.colour.level
 
-    def beside(self, columns: FloatArray) -> FloatArray:
+    def orthogonal(self, columns: FloatArray) -> FloatArray:
         """Return columns over the noise, whitened, less what the parameters can follow."""
         none = np.zeros((len(self.held), *columns.shape[1:]))
         return without(np.concatenate([self.over_noise(columns), none]), self.basis)
@@ -399,7 +399,7 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
-    free = follow.beside(used)
+    free = follow.orthogonal(used)
     weights, evidence = _weights(free, follow.target)
     item = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
@@ -492,7 +492,7 @@ def with_patch(
     names = [patches.weight(k + 1) for k in range(len(patch.weights))]
     values = {**numbers, patches.GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
 
-    def begun(theta: FloatArray) -> Fit:
+    def fit_from(theta: FloatArray) -> Fit:
         unknowns = before.unknowns
         return fit(
             before.model.with_effect(component, {**values, **unknowns.values(theta)}),
@@ -506,7 +506,7 @@ def with_patch(
     items = []
     for theta in (before.theta + patch.moved, before.theta):
         with suppress(SimulationError):
-            items.append(begun(theta))
+            items.append(fit_from(theta))
     if not items:
         raise SimulationError("The model cannot be simulated with the unnamed correction.")
     return min(items, key=lambda f: f.cost)

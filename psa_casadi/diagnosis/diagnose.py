@@ -8,7 +8,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances
-from psa_casadi.diagnosis.judgement import NAMING, told_from
+from psa_casadi.diagnosis.judgement import NAMING, indistinguishable
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.probes import laws_of, screened_with
@@ -205,7 +205,7 @@ def _named(steps: Sequence[Step], limits: Thresholds) -> dict[str, float]:
     """Return the named set of every cause, with the probability of each effect."""
     values: dict[str, float] = {}
     for step in steps[:-1]:
-        for name in (step.cause.name, *told_from(step, limits)):
+        for name in (step.cause.name, *indistinguishable(step, limits)):
             if step.probability.get(name, 0.0) >= _RIVAL:
                 values.setdefault(name, step.probability[name])
     return values

@@ -149,7 +149,7 @@ def _added(
         port=port.words,
         evidence=scale.evidence(h) - scale.evidence(of),
         held=h.errors,
-        predicted=h.shown,
+        predicted=h.predictions,
         of=" and ".join(n for n in place.names if n in seen),
         unit=port.unit,
         variable=name,

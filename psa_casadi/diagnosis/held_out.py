@@ -212,7 +212,7 @@ class Share:
     interval: tuple[float, float]
 
     @property
-    def shown(self) -> tuple[float, float, float]:
+    def clipped(self) -> tuple[float, float, float]:
         """The share and the ends of its interval as they are shown, cut to 0 to 1."""
         share, low, high = (min(max(v, 0.0), 1.0) for v in (self.share, *self.interval))
         return share, low, high
@@ -223,7 +223,7 @@ class Share:
 
         A share that is not 0 is never told as 0, one below 1 told as 100 only from 99.995 on.
         """
-        share, low, high = self.shown
+        share, low, high = self.clipped
         off = min(1.0 - self.interval[0], self.interval[1])
         off = 1.0 if off < 0.0 else off  # beyond what is shown
         digits = 0 if off > 0.01 else 1 if off > 0.001 else 2

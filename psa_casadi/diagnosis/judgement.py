@@ -11,7 +11,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
-from psa_casadi.diagnosis.families import SUREST, Family, Shown, families, place_and_kind
+from psa_casadi.diagnosis.families import SUREST, CauseEvidence, Family, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
@@ -28,7 +28,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.result import MISSED
@@ -64,7 +64,7 @@ class Weighed:
         return min({"": self.share, **self.each}.items(), key=lambda item: item[1])
 
 
-def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
+def indistinguishable(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
     if step.chosen is None:
         return ()
@@ -106,7 +106,7 @@ class Judge:
         """Return the unnamed corrections beside a hypothesis."""
         raise NotImplementedError
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return what only held-out samples tell that a model misses, and its p value."""
         raise NotImplementedError
 
@@ -128,15 +128,15 @@ class Judge:
     def left(self, step: Step) -> Remaining:
         """Return what the model of a step leaves, in fitted samples or in held-out ones."""
         if step not in self._left:
-            test, beyond = step.test, self.unseen(step)
+            test, beyond = step.test, self.held_out_finding(step)
             finding, p = (NOISE, 1.0) if beyond is None else beyond
             finding = test.finding if test.alarm else finding
             self._left[step] = Remaining(finding is NOISE, min(test.p_value, p), finding)
         return self._left[step]
 
-    def _shown(self, evidence: float) -> Shown:
+    def _shown(self, evidence: float) -> CauseEvidence:
         """Return what a cause has beside the others that has so much evidence."""
-        return Shown(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
+        return CauseEvidence(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
 
     @property
     def missing(self) -> bool:
@@ -152,7 +152,7 @@ class Judge:
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
         result = self.corrections(before) if beside else ()
-        removed = removed_from(self.experiments, before.shown, self.noise)
+        removed = removed_from(self.experiments, before.predictions, self.noise)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
@@ -161,7 +161,7 @@ class Judge:
         }
         return Weighed(
             evidence=self.scale.evidence(after) - self.scale.evidence(before),
-            share=removed.from_base(after.shown),
+            share=removed.from_base(after.predictions),
             each=each,
             corrections=result,
         )
@@ -191,17 +191,17 @@ class Judge:
         if less.fit is self.first.fit:
             return self.weighed
         weighed = self.weigh(less, self.last.view.of)
-        more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
+        more = {c.name: max(c.evidence, 0.0) for c in self._last_corrections}
         pairs = [(c, c.evidence - more.get(c.name, 0.0)) for c in weighed.corrections]
         return replace(weighed, corrections=[replace(c, evidence=e) for c, e in pairs])
 
     @cached_property
-    def _beside_last(self) -> Sequence[Correction]:
+    def _last_corrections(self) -> Sequence[Correction]:
         """The unnamed corrections beside all causes, where structure remains."""
         return self.corrections(self.last.view.of) if self.last.test.alarm else ()
 
     @cached_property
-    def vague(self) -> dict[str, Correction]:
+    def unlisted(self) -> dict[str, Correction]:
         """Causes that are rather none of the listed effects, with the best unnamed correction."""
         better: dict[str, Correction] = {}
         alone = max(self.weighed.corrections, key=lambda c: c.evidence, default=None)
@@ -219,7 +219,7 @@ class Judge:
     def unnamed(self) -> set[str]:
         """Causes that are vague, or without which the model is as likely."""
         price = self.limits.price
-        return {*self.vague, *(n for n, item in self.each.items() if item.evidence <= price)}
+        return {*self.unlisted, *(n for n, item in self.each.items() if item.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -259,15 +259,15 @@ class Judge:
             return "adequate"
         if self.doubt is not None or not named or little:
             return "unexplained"
-        if told_from(named[0], self.limits):
+        if indistinguishable(named[0], self.limits):
             return "ambiguous"
-        more = self.vague or not self.left(self.last).white
+        more = self.unlisted or not self.left(self.last).white
         return "partly_explained" if more else "cause_named"
 
     @cached_property
     def kept(self) -> tuple[Step, ...]:
         """The steps to the causes that the extended model holds, named or not."""
-        weak = self.verdict == "unexplained" and self.doubt is None and not self.vague
+        weak = self.verdict == "unexplained" and self.doubt is None and not self.unlisted
         return self.searched if self.verdict in NAMING or (weak and self.adds) else ()
 
     @property
@@ -276,20 +276,20 @@ class Judge:
         return self.last if self.kept else self.first
 
     @cached_property
-    def beside_final(self) -> Sequence[Correction]:
+    def final_corrections(self) -> Sequence[Correction]:
         """The unnamed corrections beside the extended model."""
         if self.final is self.last and self.last.test.alarm:
-            return self._beside_last
+            return self._last_corrections
         return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
 
     @cached_property
     def best_correction(self) -> Correction | None:
         """The unnamed correction that would remove most of what the extended model leaves."""
         of, colour = self.final.view.of, self.last.screening.colour
-        return best_of(self.beside_final, self.experiments, of.errors, colour, self.limits)
+        return best_of(self.final_corrections, self.experiments, of.errors, colour, self.limits)
 
     @property
-    def told_correction(self) -> Correction | None:
+    def reported_correction(self) -> Correction | None:
         """The same in the form that is told."""
         return self.best_correction
 
@@ -299,16 +299,16 @@ class Judge:
         if self.best_correction is None or self.left(self.final).white:
             return ()
         most = self.best_correction.evidence
-        return families({}, {}, self._shown(most), self.beside_final, self.limits)
+        return families({}, {}, self._shown(most), self.final_corrections, self.limits)
 
     @cached_property
     def budget(self) -> Budget:
         """Where the base's held-out error goes."""
-        unnamed = self.told_correction
+        unnamed = self.reported_correction
         return budget(
-            removed_from(self.experiments, self.first.view.of.shown, self.noise),
-            self.final.view.of.shown,
-            [(s.cause.name, s.without.shown) for s in self.kept if s.without is not None],
+            removed_from(self.experiments, self.first.view.of.predictions, self.noise),
+            self.final.view.of.predictions,
+            [(s.cause.name, s.without.predictions) for s in self.kept if s.without is not None],
             None if unnamed is None else (unnamed.name, unnamed.predicted),
         )
 
@@ -321,7 +321,7 @@ class Judge:
         """
         if not self.last.test.alarm or len(self.steps) < 2 or self.verdict not in NAMING:
             return ()
-        shares = [c for c in self.budget.causes if c.what not in self.vague]
+        shares = [c for c in self.budget.causes if c.what not in self.unlisted]
         most = max((c.share for c in shares), default=0.0)
         least = min(self.limits.form, self.limits.enough * most if most > 0.0 else most)
         return tuple(c for c in shares if c.share < least)
@@ -343,8 +343,8 @@ class Judge:
             belongs_to=step.cause.belongs_to,
             confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
-            cannot_be_told_from=told_from(step, self.limits),
-            explained_share=0.0 if item is None else item.shown[0],
+            cannot_be_told_from=indistinguishable(step, self.limits),
+            explained_share=0.0 if item is None else item.clipped[0],
             remedy=step.cause.what_now.code,
             sizes=tuple(sizes),
             port=port,
@@ -360,7 +360,7 @@ class Judge:
         (output, share), kept = self.weighed.least, False
         if self.doubt is not None:
             why = self.doubt
-        elif self.vague:
+        elif self.unlisted:
             why = self._better()
         else:
             more = self.last.test.alarm
@@ -371,15 +371,15 @@ class Judge:
         )  # fmt: skip
 
     def _better(self) -> Note:
-        return note("better_unnamed", each=tuple((c.said, n) for n, c in self.vague.items()))
+        return note("better_unnamed", each=tuple((c.label, n) for n, c in self.unlisted.items()))
 
     @property
-    def said(self) -> tuple[Note | str, ...]:
+    def remarks(self) -> tuple[Note | str, ...]:
         """Which names were withdrawn, which causes are too vague or too small to be named."""
         notes = self.withdrawn() if self.verdict == "unexplained" else ()
-        if self.vague and self.verdict != "unexplained":
+        if self.unlisted and self.verdict != "unexplained":
             # they stay in the model without a name
-            notes = (note("vague", names=tuple(self.vague), why=self._better()),)
+            notes = (note("vague", names=tuple(self.unlisted), why=self._better()),)
         small = (note("small", effect=c.what, share=max(c.share, 0.0)) for c in self.small)
         return (*notes, *small)
 
@@ -415,7 +415,7 @@ class Judge:
     @property
     def common(self) -> dict[str, Any]:
         """What the diagnosis of every kind of device holds."""
-        best = self.told_correction
+        best = self.reported_correction
         share = 0.0 if self.budget.unnamed is None else self.budget.unnamed.share
         return {
             "verdict": self.verdict,
@@ -440,12 +440,17 @@ class ModelJudge(Judge):
     """
 
     def __init__(
-        self, known: Known, base: Model, table: Mapping[str, Attached], whole: Sequence[Experiment]
+        self,
+        known: SearchState,
+        base: Model,
+        table: Mapping[str, Attached],
+        whole: Sequence[Experiment],
     ) -> None:
         super().__init__(steps_of(known), known.task)
         self.known, self.base, self.table, self.whole = known, base, table, whole
         self.views = {s.view.of.names: s.view for s in self.steps}
-        self.views |= {s.beside.of.names: s.beside for s in self.steps if s.beside is not None}
+        views = [s.view_without for s in self.steps if s.view_without is not None]
+        self.views |= {v.of.names: v for v in views}
 
     @cached_property
     def noise(self) -> tuple[float, ...]:
@@ -474,7 +479,7 @@ class ModelJudge(Judge):
         return [self.table[c.name] for c in of.causes]
 
     @cached_property
-    def told_correction(self) -> Correction | None:
+    def reported_correction(self) -> Correction | None:
         """The unnamed correction as a formula, where few terms predict as well."""
         best, of = self.best_correction, self.final.view.of
         if not isinstance(best, FreeFunction):
@@ -483,12 +488,12 @@ class ModelJudge(Judge):
         law = formula_of(best, of, self.task, self.base, effects, self.scale, self.whole)
         return best if law is None else replace(law, open_to=best.open_to)
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones.
 
         Without causes these leave noise of any colour, and the innovations are compared.
         """
-        rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.own, strict=True)
+        rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.colours, strict=True)
         for o, noise, item in rows:
             if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
                 excess = held_out_within(item, len(step.fit.theta), self.limits)
@@ -497,7 +502,7 @@ class ModelJudge(Judge):
                     return output, excess.p_value
                 continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
-            rms = missed_rms(self.experiments, step.view.of.shown, o.number)
+            rms = missed_rms(self.experiments, step.view.of.predictions, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
             if held and rms > least:
                 output = note("held_out_unlike", output=o.column, ratio=rms / noise)
@@ -525,10 +530,10 @@ class ModelJudge(Judge):
         return self.cause(step, sizes, self.table[step.cause.name].port.words)
 
     @property
-    def said(self) -> tuple[Note | str, ...]:
+    def remarks(self) -> tuple[Note | str, ...]:
         """What is said of any, which causes cancel each other, which add too little to be told."""
         left_out = () if self.doubt else self._left_out()
-        return (*super().said, *self._cancelling(), *left_out)
+        return (*super().remarks, *self._cancelling(), *left_out)
 
     def _cancelling(self) -> tuple[Note, ...]:
         """Return the output that one of several causes changes much more than all of them do."""
@@ -556,12 +561,12 @@ class ModelJudge(Judge):
             return ()
         clearly = self.limits.clearly * temperature(known.scale.evidence(best))
         least = known.scale.score(best) + clearly
-        better = [h for h in known.found.values() if known.scale.score(h) > least]
-        better = [h for h in better if known.slight(h) and known.worth(h, form=False)]
+        better = [h for h in known.hypotheses.values() if known.scale.score(h) > least]
+        better = [h for h in better if known.small_causes(h) and known.is_admissible(h, form=False)]
         top = max(better, key=known.scale.score, default=None)
         if top is None:
             return ()
-        names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
+        names, small = (tuple(sorted(n)) for n in (top.names, known.small_causes(top)))
         more = known.scale.evidence(top) - known.scale.evidence(best)
         return (note("slight", names=names, more=more, small=small, least=self.limits.further),)
 
@@ -570,18 +575,14 @@ class ModelJudge(Judge):
         """Return the diagnosis."""
         first, final = self.first, self.final
         experiments, noise = self._noise(final)
-        errors = tuple(
-            OutputError(
-                o.column,
-                o.channel.unit,
-                level,
-                *(missed_rms(self.experiments, s.view.of.shown, o.number) for s in (first, final)),
-            )
-            for o, level in zip(final.fit.channels, noise, strict=True)
-        )
+        both = [s.view.of.predictions for s in (first, final)]
+        errors = []
+        for o, level in zip(final.fit.channels, noise, strict=True):
+            rms = [missed_rms(self.experiments, p, o.number) for p in both]
+            errors.append(OutputError(o.column, o.channel.unit, level, *rms))
         extended = self.extended
         base = tuple(first.fit.outputs(self.experiments)) if self.kept else extended
         return Diagnosis(
-            errors=errors, remarks=self.said, experiments=experiments, base=base,
+            errors=tuple(errors), remarks=self.remarks, experiments=experiments, base=base,
             extended=extended, **self.common,
         )  # fmt: skip

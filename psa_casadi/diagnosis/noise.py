@@ -95,7 +95,7 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     return result.autoregression if result.level <= rms(residual) else None
 
 
-def knowable(
+def detection_limit(
     record: Record, error: float, residual: FloatArray, limits: Thresholds = LIMITS
 ) -> float:
     """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
@@ -111,12 +111,12 @@ def knowable(
     return float(np.sqrt(rounding**2 + error**2 + (limits.form_of_range * size) ** 2))
 
 
-def knowable_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
+def detection_limit_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
     """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
     error = max((s.error for s in fit.simulated), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
     pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
-    squares = [knowable(e.record, error, part, limits) ** 2 for e, part in pairs]
+    squares = [detection_limit(e.record, error, part, limits) ** 2 for e, part in pairs]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 

@@ -75,7 +75,7 @@ class OwnColour:
         """It as the colour of the fitted samples, which begins anew after every gap."""
         each = (self.autoregression,) * len(self.runs)
         level = max(self.level, 1e-15)
-        return Colour(each, level, self.runs, begins=False, spread=self.spread)
+        return Colour(each, level, self.runs, known_start=False, spread=self.spread)
 
     @property
     def tested(self) -> tuple[FloatArray, Colour]:

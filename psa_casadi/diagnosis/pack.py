@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, noise_rms
-from psa_casadi.diagnosis.noise import knowable_of
+from psa_casadi.diagnosis.noise import detection_limit_of
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
@@ -50,7 +50,8 @@ class Pack:
             for along in moving or [np.zeros(len(left))]:
                 result = omnibus(
                     left, along, np.concatenate(time), noise, noise_rms(f.residuals, noise),
-                    lengths=f.lengths, knowable=f.straight, own=own, alarms_below=limits.alarm,
+                    lengths=f.lengths, detection_limit=f.straight, own=own,
+                    alarms_below=limits.alarm,
                 )  # fmt: skip
                 rows.append(replace(result, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
@@ -62,12 +63,12 @@ class Pack:
         """Return whether what a direction promises to remove can be told of the device."""
         return any(f.rms > f.straight for f in fit.channels)
 
-    def told(self, fit: Fit, before: Fit, removed: float, knowable: float) -> bool:
-        """Return whether a fit removes more of another one's error than what cannot be told."""
+    def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
+        """Return whether a fit removes more of another one's error than the detection limit."""
         pairs = zip(fit.channels, before.channels, strict=True)
         return any(old.rms**2 - new.rms**2 > new.straight**2 for new, old in pairs)
 
-    def in_character(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
         """Return whether the data ask for this effect and not for something else."""
         return inside_ranges(fit.model.values, cause)
 
@@ -93,31 +94,31 @@ class StackPack(Pack):
             noise = noise_rms(residual, of)
             return omnibus(
                 residual, voltage, time, of, noise,
-                lengths=[int(e.used.sum()) for e in parts], knowable=least, own=own,
+                lengths=[int(e.used.sum()) for e in parts], detection_limit=least, own=own,
                 alarms_below=limits.alarm,
             )  # fmt: skip
 
         first, *others = residuals
-        test = test_of(first, experiments, colour, knowable_of(fit, experiments, limits))
+        test = test_of(first, experiments, colour, detection_limit_of(fit, experiments, limits))
         for f, left, of in zip(fit.further, others, colour.further, strict=True):
             if test.alarm:
                 break
             result = test_of(left, [experiments[k] for k in f.records], of, f.straight)
-            p, least = min(1.0, result.p_value * (1 + len(fit.further))), test.knowable
+            p, least = min(1.0, result.p_value * (1 + len(fit.further))), test.detection_limit
             if result.alarm and p < limits.alarm:
                 size = max(test.size, 2.0 * least)
-                test = replace(result, p_value=p, size=size, knowable=least, output=f.column)
+                test = replace(result, p_value=p, size=size, detection_limit=least, output=f.column)
         return test
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
         """Return whether the power [m^2] that a direction promises to remove can be told."""
-        return promise > test.knowable**2
+        return promise > test.detection_limit**2
 
-    def told(self, fit: Fit, before: Fit, removed: float, knowable: float) -> bool:
-        """Return whether more power is removed [m^2] than can be told."""
-        return removed > knowable**2
+    def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
+        """Return whether the `removed` power [m^2] exceeds that of the limit `least` [m]."""
+        return removed > least**2
 
-    def in_character(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
         """Return whether the data ask for this effect and not for something else.
 
         Not with a parameter pushed to the end of its range, a tone among the harmonics of a
@@ -169,7 +170,7 @@ class Task:
         """Whether the device may ring within a record's band."""
         return self.pack.is_stack and shows_ringing(self.experiments)
 
-    def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
+    def indistinguishable(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
         return same_curves(self.experiments, self.table, fit) if self.pack.is_stack else ()
 

@@ -294,7 +294,7 @@ class _Beside:
             finite=finite, way=way, outputs=self.outputs,
         )  # fmt: skip
 
-    def tells(self, columns: FloatArray, error: float) -> bool:
+    def is_clear(self, columns: FloatArray, error: float) -> bool:
         """Whether what the fitted parameters leave of every column is clear of its error."""
         left = columns - self.fitted @ (self.fitted.T @ columns)
         sizes = np.linalg.norm(left, axis=0) - _CLEAR * error * np.linalg.norm(columns, axis=0)
@@ -346,7 +346,7 @@ def _directions_at(
                 arguments, clear = (fit, experiments, model, moved, memory, step), False
                 if effect.name in alongside.laws:
                     columns, further, error = _changes(*arguments, alongside)
-                    clear = alongside.tells(columns, error)
+                    clear = alongside.is_clear(columns, error)
                 if not clear:
                     columns, further = changes(*arguments)
             except PsaError:

@@ -32,7 +32,7 @@ _END = 8.2
 #: over the stroke lies between these limits; if none does, by that which comes nearest.
 _FACTORS = (1.0, 3.0, 0.3, 10.0, 0.1, 0.03, 0.02, 30.0, 100.0)
 _PLAIN = (3e-3, 3e-2)
-#: Everything is a function of time: another coordinate is told where it has this share of it.
+#: Everything is a function of time: another coordinate is weight where it has this share of it.
 _RATHER = 0.8
 #: Warming [K] during a play, for effects that follow the temperature.
 _WARMING = 3.0
@@ -183,10 +183,10 @@ def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, Fl
         axis, _ = views.hold_axis(record)
         items.append(_view(axis, _since_it_began(axis.x, d)))
 
-    def told(row: tuple[views.View, FloatArray, FloatArray]) -> float:
+    def weight(row: tuple[views.View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
-    return max(items, key=told)
+    return max(items, key=weight)
 
 
 def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, FloatArray]:

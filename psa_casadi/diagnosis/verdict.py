@@ -15,7 +15,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis import held_out
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
-from psa_casadi.diagnosis.judgement import Judge, told_from
+from psa_casadi.diagnosis.judgement import Judge, indistinguishable
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.pack import Task
@@ -62,7 +62,7 @@ def blind_spots(
     spots = []
     present = {c.name for c in final.fit.model.components}
     present |= {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
-    present |= {n for s in steps for n in told_from(s, limits)}
+    present |= {n for s in steps for n in indistinguishable(s, limits)}
     factor = np.sqrt(final.screening.threshold)
     for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
@@ -139,7 +139,7 @@ def alternatives(
     items = []
     for step in named:
         for name in sorted(
-            told_from(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
+            indistinguishable(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
         ):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
@@ -161,9 +161,9 @@ def alternatives(
 def _fitted(step: Step, name: str) -> Hypothesis | None:
     """Return the hypothesis with another effect in a cause's place, fitted to its end."""
     known = step.instead.get(name)
-    if known is None and step.beside is not None:
-        starts = step.beside.starts_of(name)
-        known = with_cause(step.beside.of, starts) if starts else None
+    if known is None and step.view_without is not None:
+        starts = step.view_without.starts_of(name)
+        known = with_cause(step.view_without.of, starts) if starts else None
     return known if known is None or known.final else to_end(known)
 
 
@@ -291,10 +291,10 @@ class StackJudge(Judge):
         """Return the corrections beside a hypothesis, by columns at the stack's ports."""
         return corrections(of.fit, self.experiments, self.last.screening.colour)
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
         excess = held_out_excess(
-            step.fit, self.experiments, step.predicted, step.view.of.own[0], self.floors,
+            step.fit, self.experiments, step.predicted, step.view.of.colours[0], self.floors,
             self.limits,
         )  # fmt: skip
         return (note("held_out_error", factor=excess.factor), excess.p_value) if excess else None
@@ -334,7 +334,7 @@ class StackJudge(Judge):
             next_experiment=next_experiment(
                 self.causes, self.verdict, texts, records, doubted=self.doubt is not None
             ),
-            remarks=(*self.model.provenance.notes, *self.said, *coverage_notes(experiments)),
+            remarks=(*self.model.provenance.notes, *self.remarks, *coverage_notes(experiments)),
             experiments=tuple(experiments),
             base=both[0],
             extended=both[1],

@@ -206,7 +206,9 @@ def with_causes_afresh(
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
 
 
-def afresh(before: Hypothesis, first: Hypothesis, goal: float = np.inf) -> Hypothesis | None:
+def fit_from_default(
+    before: Hypothesis, first: Hypothesis, goal: float = np.inf
+) -> Hypothesis | None:
     """Fit the last cause of a hypothesis again from an ordinary base and gains of both signs.
 
     A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
@@ -220,7 +222,7 @@ def afresh(before: Hypothesis, first: Hypothesis, goal: float = np.inf) -> Hypot
     return hypothesis(first.causes, final, before.experiments)
 
 
-def any_afresh(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
+def fit_any_from_default(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
     """Fit the effects of the scores afresh; return the best of all."""
     results = side_by_side(
         lambda d: _from_ordinary(before.fit, before.experiments, d.effect, d.values),
@@ -364,7 +366,7 @@ def to_end(of: Hypothesis, goal: float = np.inf) -> Hypothesis:
     return ended or replace(of, final=True)
 
 
-def begun_again(of: Hypothesis) -> Hypothesis | None:
+def refit_at_bound(of: Hypothesis) -> Hypothesis | None:
     """Fit once more where a cause has come near the end of its range: another minimum may hold it.
 
     That cause begins with its declared values, at half and at twice its gain; what is found is of

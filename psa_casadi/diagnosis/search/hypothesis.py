@@ -51,32 +51,32 @@ from psa_casadi.units import FloatArray
 class Hypothesis:
     """A model with some causes beside the base, fitted to the records of `experiments`.
 
-    `causes` are in the order in which the search found them; `shown` (n, channels) are the
+    `causes` are in the order in which the search found them; `predictions` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
     held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
-    `own` is the colour that every channel's residual has by itself; `final` says that the fit went
+    `colours` are those that every channel's residual has by itself; `final` says that the fit went
     on to its end.
     """
 
     causes: tuple[Component, ...]
     fit: Fit
     experiments: Sequence[Experiment]
-    shown: tuple[FloatArray, ...]
+    predictions: tuple[FloatArray, ...]
     held: tuple[float, ...]
     train: tuple[float, ...]
     whole: tuple[float, ...]
-    own: tuple[OwnColour, ...]
+    colours: tuple[OwnColour, ...]
     final: bool = False
 
     @property
     def predicted(self) -> tuple[FloatArray, ...]:
         """The predictions (n,) of the first channel."""
-        return tuple(y[:, 0] for y in self.shown)
+        return tuple(y[:, 0] for y in self.predictions)
 
     @property
     def colour(self) -> Colour:
         """The colour of its own residual, in every channel's fitted samples."""
-        first, *others = (item.colour for item in self.own)
+        first, *others = (item.colour for item in self.colours)
         return replace(first, further=tuple(others))
 
     def beyond_noise(self, before: "Hypothesis", held: Sequence[int], chance: float) -> float:
@@ -86,7 +86,7 @@ class Hypothesis:
         out, of which noise of the other one's colour leaves few independent ones. Less than 0 where
         noise of another colour explains the data as well [nats].
         """
-        rows = list(zip(self.fit.channels, before.own, self.own, strict=True))
+        rows = list(zip(self.fit.channels, before.colours, self.colours, strict=True))
         gained = sum(new.nats(f.straight) - old.nats(f.straight) for f, old, new in rows)
         levels = [float(np.hypot(new.level, f.straight)) for f, _, new in rows]
         straight = [f.straight for f in self.fit.channels]
@@ -187,11 +187,11 @@ def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     if task.pack.is_stack:
         return of  # noise of any colour is the sensor's
     own = []
-    for k, (f, colour) in enumerate(zip(of.fit.channels, of.own, strict=True)):
-        pairs = zip(of.experiments, of.shown, strict=True)
+    for k, (f, colour) in enumerate(zip(of.fit.channels, of.colours, strict=True)):
+        pairs = zip(of.experiments, of.predictions, strict=True)
         errors = [e.errors(f.number, y[:, k]) for e, y in pairs]
         own.append(entering(of.fit, of.experiments, errors, k, colour))
-    return replace(of, own=tuple(own))
+    return replace(of, colours=tuple(own))
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
@@ -358,11 +358,11 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     screening = _screened(fit, kept, task)
     residuals, colour, alone = [f.residuals for f in fit.channels], screening.colour, not of.causes
     if alone:  # is there anything but noise of some colour?
-        tested = [c.tested for c in of.own]
+        tested = [c.tested for c in of.colours]
         residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
         colour = replace(colour, further=tuple(others))
     test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=alone)
-    coloured = alone and any(c.autoregression.size for c in of.own)
+    coloured = alone and any(c.autoregression.size for c in of.colours)
     if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
@@ -382,7 +382,7 @@ def _asked(
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
     share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
     size = float(np.sqrt(min(share, 1.0))) * fit.rms
-    requested = replace(test, p_value=p, seen="effect", size=size)
+    requested = replace(test, p_value=p, structure="effect", size=size)
     return requested if requested.alarm else test
 
 
@@ -411,7 +411,7 @@ def held_out_confirms(of: Hypothesis, before: Hypothesis, scale: Scale) -> bool:
         return True
     promise = 0.0
     for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
-        rows = zip(of.experiments, of.shown, before.shown, strict=True)
+        rows = zip(of.experiments, of.predictions, before.predictions, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )

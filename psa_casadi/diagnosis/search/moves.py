@@ -9,7 +9,7 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies, temperature
 from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
+from psa_casadi.diagnosis.search.state import FINALISTS, NEAR, SearchState, nearly
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -136,10 +136,10 @@ _MOST = 3
 
 
 @stage("causes judged again")
-def exchange(h: Hypothesis, known: Known) -> None:
+def exchange(h: Hypothesis, known: SearchState) -> None:
     """Fit in each cause's place what the screening beside all others finds near it."""
     for cause in h.causes:
-        less = known.found.get(h.names - {cause.name})
+        less = known.hypotheses.get(h.names - {cause.name})
         if less is None:
             continue
         if len(h.causes) > 1:
@@ -154,7 +154,7 @@ def exchange(h: Hypothesis, known: Known) -> None:
             known.remember(less, name)
 
 
-def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
+def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Score]]:
     """Return the starts of effects that promise nearly what `h` gains beside the causes of `less`.
 
     They are not among the causes, and bend no curve that one of them bends.
@@ -171,7 +171,9 @@ def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
     ]
 
 
-def _put_in_place(h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: Known) -> None:
+def _put_in_place(
+    h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: SearchState
+) -> None:
     """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
 
     To the end where that comes near.
@@ -184,12 +186,12 @@ def _put_in_place(h: Hypothesis, less: Hypothesis, starts: Sequence[Score], know
     effect = _effect(starts)
     known.note(fits.in_place(h, less, h.fit, rival.fit, effect, goal))
     known.remember(less, effect.name)
-    best = known.found.get(rival.names)
+    best = known.hypotheses.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
         known.finish([best])
 
 
-def _copies(h: Hypothesis, less: Hypothesis, known: Known) -> list[Copy]:
+def _copies(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[Copy]:
     """Return effects that could add what the cause not in `less` adds, but were not fitted so.
 
     A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is
@@ -204,7 +206,7 @@ def _copies(h: Hypothesis, less: Hypothesis, known: Known) -> list[Copy]:
     lost: dict[str, float] = {}
     for name, copy in result.items():
         left = 0.5 * power * (1.0 - copy.share)
-        fitted = known.found.get(less.names | {name})
+        fitted = known.hypotheses.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
         if left < NEAR and reached < item - left - NEAR:
             lost[name] = left
@@ -222,7 +224,7 @@ _PAIRS = 2
 
 
 @stage("fits of several at once")
-def fit_sets(known: Known, h: Hypothesis) -> None:
+def fit_sets(known: SearchState, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
     The cause that explains most alone, that of `h`, may stand for several and hold the search
@@ -231,7 +233,7 @@ def fit_sets(known: Known, h: Hypothesis) -> None:
     with both. These go to their end, since they need more steps for it.
     """
     root, task, price = known.root, known.task, known.scale.limits.price
-    view, similar = known.view(root), task.alike(root.fit)
+    view, similar = known.view(root), task.indistinguishable(root.fit)
     if not view.trials:
         return
     every = [
@@ -245,7 +247,7 @@ def fit_sets(known: Known, h: Hypothesis) -> None:
     items = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
     pairs = [s for s in ranked if s.names in items]
     apart = [s for s in ranked if not s.names & h.names]
-    starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
+    starts = [s for s in [*pairs, *apart] if s.names not in known.hypotheses][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes: fitting {text}")
     goal = fits.cost_beside(known.best(), root)
@@ -266,7 +268,7 @@ def fit_sets(known: Known, h: Hypothesis) -> None:
 
 
 @stage("fits afresh")
-def fit_from_other_parents(h: Hypothesis, known: Known) -> None:
+def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
     """Fit children of a hypothesis from their other parents, where those promise more.
 
     Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
@@ -274,19 +276,19 @@ def fit_from_other_parents(h: Hypothesis, known: Known) -> None:
     """
     evidence = known.scale.evidence
     for cause in h.causes:
-        shared = known.found.get(h.names - {cause.name})
+        shared = known.hypotheses.get(h.names - {cause.name})
         if shared is None or not shared.causes:
             continue
         gained = evidence(h) - evidence(shared) - known.scale.limits.price
         for child in known.children(h):
-            other = known.found.get(child.names - {cause.name})
+            other = known.hypotheses.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
                 known.task.progress(f"cause {len(child.causes)}: {added} once more")
                 known.note(fits.in_place(child, other, other.fit, h.fit, cause))
 
 
-def fit_rivals(known: Known) -> None:
+def fit_rivals(known: SearchState) -> None:
     """Fit to their end the effects that may be in the place of each cause of the answer.
 
     By their estimated evidence beside the other causes they are not clearly less likely.
@@ -294,19 +296,20 @@ def fit_rivals(known: Known) -> None:
     best = known.answer
     for cause in best.causes:
         names = best.names - {cause.name}
-        if names not in known.found:
+        if names not in known.hypotheses:
             known.note(fits.without(best, cause))
-        less = known.found.get(names)
+        less = known.hypotheses.get(names)
         if less is None:
             continue
         view, item = known.view(less), known.scale.evidence(less)
         top = known.scale.evidence(best) - item
         near = top - known.task.limits.clearly * temperature(top)
         for name, evidence in view.estimated().items():
-            if evidence > near and names | {name} not in known.found:
+            if evidence > near and names | {name} not in known.hypotheses:
                 known.note(fits.with_cause(less, view.starts_of(name)))
-        items = [h for h in known.found.values() if h.names > names and len(h.names - names) == 1]
-        known.remember(less, *(n for h in items for n in h.names - names))
-        open_ones = [h for h in items if not h.final]
+        larger = [h for h in known.hypotheses.values() if h.names > names]
+        children = [h for h in larger if len(h.names - names) == 1]
+        known.remember(less, *(n for h in children for n in h.names - names))
+        open_ones = [h for h in children if not h.final]
         known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
-    known.worthy = frozenset(n for n, h in known.found.items() if known.worth(h))
+    known.admissible = frozenset(n for n, h in known.hypotheses.items() if known.is_admissible(h))

@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
 )
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
@@ -46,7 +46,7 @@ class Step:
     where there are later ones, and of effects that bend the same curve the best one's;
     `probability` that of being the cause, given that one effect of the table is. `chosen` is the
     hypothesis with the next cause, None of the last step; `without` the one with all causes but
-    this, `beside` what that one still shows, and `instead` the hypotheses with other effects in
+    this, `view_without` what that one leaves, and `instead` the hypotheses with other effects in
     this cause's place. `remarks` of the last step say what the search has left.
     """
 
@@ -54,7 +54,7 @@ class Step:
     fitted: Mapping[str, Hypothesis] = field(default_factory=dict)
     chosen: Hypothesis | None = None
     without: Hypothesis | None = None
-    beside: View | None = None
+    view_without: View | None = None
     instead: Mapping[str, Hypothesis] = field(default_factory=dict)
     alone: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
@@ -89,7 +89,7 @@ class Step:
         return self.chosen.causes[-1]
 
 
-def steps_of(known: Known) -> list[Step]:
+def steps_of(known: SearchState) -> list[Step]:
     """Return the steps to the best hypothesis; the last one is that itself."""
     ways = [*(_way(known, k) for k in range(len(known.answer.causes))), known.answer]
     views = [_view(known, h) for h in ways]
@@ -103,10 +103,10 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 
-def _way(known: Known, count: int) -> Hypothesis:
+def _way(known: SearchState, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
     best = known.answer
-    item = known.found.get(best.names_upto(count))
+    item = known.hypotheses.get(best.names_upto(count))
     if item is not None:
         return replace(item, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
@@ -115,7 +115,7 @@ def _way(known: Known, count: int) -> Hypothesis:
     return best
 
 
-def _view(known: Known, h: Hypothesis) -> View:
+def _view(known: SearchState, h: Hypothesis) -> View:
     """Look at a hypothesis; what effects would add is known from where the search began."""
     view = known.views.get(h.names)
     if view is None or view.of.fit is not h.fit:
@@ -123,17 +123,17 @@ def _view(known: Known, h: Hypothesis) -> View:
     return view if view.of is h else replace(view, of=h)
 
 
-def _step(known: Known, view: View, chosen: Hypothesis | None) -> Step:
+def _step(known: SearchState, view: View, chosen: Hypothesis | None) -> Step:
     fitted, gain, task = _fitted(known, view.of), known.scale.gain, known.task
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
     evidence = known.scale.evidence(view.of)
     alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
     if chosen is None:
-        refused = {n for n, c in fitted.items() if c.names not in known.worthy}
+        refused = {n for n, c in fitted.items() if c.names not in known.admissible}
         return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, evidence, task)
     cause = chosen.causes[-1]
-    less = known.found.get(known.answer.names - {cause.name}) or without(known.answer, cause)
+    less = known.hypotheses.get(known.answer.names - {cause.name}) or without(known.answer, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
         return _judged(
             Step(view, fitted, chosen, alone=alone), alone, fitted, set(), evidence, task
@@ -141,14 +141,14 @@ def _step(known: Known, view: View, chosen: Hypothesis | None) -> Step:
     there = _view(known, less)
     instead = {**_fitted(known, less), cause.name: known.answer}
     beside = {**there.estimated(), **{n: gain(c, less) for n, c in instead.items()}}
-    refused = {n for n, c in instead.items() if c.names not in known.worthy} - {cause.name}
+    refused = {n for n, c in instead.items() if c.names not in known.admissible} - {cause.name}
     step = Step(view, fitted, chosen, less, there, instead, alone)
     return _judged(step, beside, instead, refused, known.scale.evidence(known.answer), task)
 
 
-def _fitted(known: Known, h: Hypothesis) -> dict[str, Hypothesis]:
+def _fitted(known: SearchState, h: Hypothesis) -> dict[str, Hypothesis]:
     """Return the hypotheses with one more effect, by its name."""
-    every = {n: known.found.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
+    every = {n: known.hypotheses.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
     return {n: child for n, child in every.items() if child is not None}
 
 
@@ -166,11 +166,11 @@ def _judged(
 
     Effects that bend the same curve are refused together, and share what the best of them has.
     """
-    similar, good, pack = task.alike(step.fit), set(fitted) - refused, task.pack
+    similar, good, pack = task.indistinguishable(step.fit), set(fitted) - refused, task.pack
     for group in similar:
         if good & set(group):
             every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
-            like = {n for n, h, c in every if pack.in_character(h.fit, c, task.experiments)}
+            like = {n for n, h, c in every if pack.is_admissible(h.fit, c, task.experiments)}
             refused = refused - (set(group) & like)
         elif refused & set(group):
             refused = refused | set(group)

@@ -128,7 +128,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     noise = {e.output: e.noise for e in d.errors}
     items = []
     for j in range(count):
-        base, extended = d.shown(j)
+        base, extended = d.predictions(j)
         for k, e in enumerate(d.experiments):
             curves = [Curve("base model", colours.BASE, base[k])]
             if phrases.added(d):

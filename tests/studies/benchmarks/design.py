@@ -137,7 +137,7 @@ def likely_rival(record: psa.Record, effect: str) -> str:
     plain = hypothesis((), base, experiments)
     assert plain is not None
     task = Task(experiments, tuple(table), STACK)
-    evidence = levelled(examine(plain, task).estimated(), task.alike(base))
+    evidence = levelled(examine(plain, task).estimated(), task.indistinguishable(base))
     return max((n for n in evidence if n != effect), key=lambda n: evidence[n])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.pack import Task, is_dynamic
-from psa_casadi.diagnosis.search.fits import as_led, begun_again, cost_beside, to_end
+from psa_casadi.diagnosis.search.fits import as_led, cost_beside, refit_at_bound, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
@@ -40,17 +40,17 @@ Names = frozenset[str]
 NONE: Names = frozenset()
 
 
-class Known:
+class SearchState:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
-    `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
+    `hypotheses` holds them by their causes, `views` those whose residual was tested, `fitted` the
     effects fitted beside each, `trials` what effects would add to the base. A search that has ended
-    has an `answer`, and the causes of all that is worth having (`worthy`); `remarks` say what it
-    has left.
+    has an `answer`, and the causes of all `admissible` hypotheses; `remarks` say which steps it has
+    left out.
     """
 
     answer: Hypothesis
-    worthy: frozenset[Names]
+    admissible: frozenset[Names]
     remarks: tuple[Note, ...] = ()
 
     def __init__(self, base: Fit, task: Task) -> None:
@@ -61,42 +61,42 @@ class Known:
         self.scale = scale_of(root, first.screening.colour, task.limits)
         if "held out" in task.method.without:
             self.scale = replace(self.scale, held=())
-        self.found: dict[Names, Hypothesis] = {root.names: root}
+        self.hypotheses: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.noises: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.entered: dict[Hypothesis, Hypothesis] = {}
-        self.tell(root, "finished")
+        self.notify(root, "finished")
 
     @property
     def root(self) -> Hypothesis:
         """The base without causes, as it is fitted by now."""
-        return self.found[NONE]
+        return self.hypotheses[NONE]
 
     def conclude(self) -> None:
         """End the search: choose the answer, look at it, and ask what else is worth having."""
         self.view(self.best())
         self.answer = self.in_order(self.best())
         self.view(self.answer)
-        self.tell(self.answer, "best")
-        self.worthy = frozenset(n for n, h in self.found.items() if self.worth(h))
+        self.notify(self.answer, "best")
+        self.admissible = frozenset(n for n, h in self.hypotheses.items() if self.is_admissible(h))
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
 
         Those that bend the same curve as another effect, which are never named alone, come last.
         """
-        shared = {n for group in self.task.alike(self.root.fit) for n in group}
+        shared = {n for group in self.task.indistinguishable(self.root.fit) for n in group}
         left: list[Component] = list(h.causes)
         causes: list[Component] = []
         while left:
             names = frozenset(c.name for c in causes)
-            known = [self.found.get(names | {c.name}) for c in left]
+            known = [self.hypotheses.get(names | {c.name}) for c in left]
             gains = [-np.inf if k is None else self.scale.evidence(k) for k in known]
             ranks = [(c.name not in shared, g) for c, g in zip(left, gains, strict=True)]
             causes.append(left.pop(ranks.index(max(ranks))))
-        self.found[h.names] = ordered = replace(h, causes=tuple(causes))
+        self.hypotheses[h.names] = ordered = replace(h, causes=tuple(causes))
         return ordered
 
     def note(self, found: Hypothesis | None) -> None:
@@ -106,16 +106,16 @@ class Known:
         """
         if found is None:
             return
-        old, evidence = self.found.get(found.names), self.scale.evidence
+        old, evidence = self.hypotheses.get(found.names), self.scale.evidence
         gained = np.inf if old is None else evidence(found) - evidence(old)
         ahead = 0.0 if old is None else self.scale.held_out(found, old)
         if gained > _SAME and gained + ahead > 0.0:
             causes = found.causes if old is None else old.causes
             kept = replace(found, causes=causes)
-            self.found[found.names] = kept if causes else noisy(kept, self.task)
-            self.tell(kept, "finished" if kept.final else "fitted")
+            self.hypotheses[found.names] = kept if causes else noisy(kept, self.task)
+            self.notify(kept, "finished" if kept.final else "fitted")
 
-    def tell(self, h: Hypothesis, state: State) -> None:
+    def notify(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
         self.task.watch(
             Tried(
@@ -144,7 +144,7 @@ class Known:
         """Return the hypotheses with one more cause that were fitted beside one, best first."""
         children = []
         for name in self.fitted.get(h.names, ()):
-            if (child := self.found.get(h.names | {name})) is not None:
+            if (child := self.hypotheses.get(h.names | {name})) is not None:
                 added = [c for c in child.causes if c.name not in h.names]
                 children.append(replace(child, causes=(*h.causes, *added)))
         return sorted(children, key=lambda c: -self.scale.evidence(c))
@@ -171,12 +171,12 @@ class Known:
 
     def ranked(self) -> list[Hypothesis]:
         """Return all hypotheses, that of the highest score first."""
-        return sorted(self.found.values(), key=lambda h: -self.scale.score(h))
+        return sorted(self.hypotheses.values(), key=lambda h: -self.scale.score(h))
 
     def best(self) -> Hypothesis:
         """Return the answer so far: of the highest score and worth having, fitted to its end."""
         while True:
-            top = next(h for h in self.ranked() if self.worth(h))
+            top = next(h for h in self.ranked() if self.is_admissible(h))
             if top.final:
                 return top
             self.finish([top])
@@ -185,7 +185,7 @@ class Known:
         """Return what would be better than the answer if held-out samples confirmed it."""
         best, fitted = self.best(), self.scale.of_fitted
         better = [h for h in self.ranked() if fitted(h) > fitted(best)]
-        return [h for h in better if self.worth(h, confirmed=False)]
+        return [h for h in better if self.is_admissible(h, confirmed=False)]
 
     def finish(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Fit hypotheses to their end."""
@@ -193,14 +193,14 @@ class Known:
             names = ", ".join("+".join(sorted(h.names)) for h in hypotheses)
             self.task.progress(f"{names} to the end")
         for ended in side_by_side(self._to_end, hypotheses):
-            old = self.found[ended.names]
+            old = self.hypotheses[ended.names]
             better = self.scale.evidence(ended) >= self.scale.evidence(old)
-            self.found[ended.names] = kept = ended if better else replace(old, final=True)
-            self.tell(kept, "finished")
+            self.hypotheses[ended.names] = kept = ended if better else replace(old, final=True)
+            self.notify(kept, "finished")
         if "begun again" in self.task.method.without:
             return
-        final = [self.found[h.names] for h in hypotheses]
-        for again in side_by_side(begun_again, final):
+        final = [self.hypotheses[h.names] for h in hypotheses]
+        for again in side_by_side(refit_at_bound, final):
             self.note(again)
 
     def _to_end(self, h: Hypothesis) -> Hypothesis:
@@ -213,23 +213,24 @@ class Known:
             return ended
         return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
 
-    def worth(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
+    def is_admissible(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
 
         Each has its parameters inside their ranges and removes what can be told, more than the
         `form` of the others may miss. A memory adds more than a static curve, each more than noise
         of another colour, and held-out samples have `confirmed` it.
         """
-        return all(self._worth(h, c, confirmed=confirmed, form=form) for c in h.causes)
+        return all(self._may_hold(h, c, confirmed=confirmed, form=form) for c in h.causes)
 
-    def _worth(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
+    def _may_hold(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
         out, pack = self.task.method.without, self.task.pack
-        if not pack.in_character(h.fit, cause, h.experiments):
+        if not pack.is_admissible(h.fit, cause, h.experiments):
             return False
-        before = self.found.get(h.names - {cause.name})
+        before = self.hypotheses.get(h.names - {cause.name})
+        least = self.views[NONE].test.detection_limit
         return before is None or (
-            pack.told(h.fit, before.fit, h.removes(before), self.views[NONE].test.knowable)
-            and not (form and "form" not in out and self.little(h, before))
+            pack.exceeds_detection_limit(h.fit, before.fit, h.removes(before), least)
+            and not (form and "form" not in out and self.is_small(h, before))
             and self.remembers(h, before, cause)
             and ("noise" in out or self.beyond_noise(h, before, cause))
             and (not confirmed or "held out" in out or held_out_confirms(h, before, self.scale))
@@ -243,7 +244,7 @@ class Known:
         """
         if (h, before) not in self.noises:
             result = self.exceeds(h, before)
-            if result and before.own[0].autoregression.size:
+            if result and before.colours[0].autoregression.size:
                 led = as_led(h, cause)
                 result = led is None or self.exceeds(h, led)
             self.noises[h, before] = result
@@ -257,7 +258,7 @@ class Known:
         least, held = self.task.limits.price, self.scale.held
         if h.beyond_noise(before, held, least) > least:
             return True
-        entered = any(c.entering for c in before.own)
+        entered = any(c.entering for c in before.colours)
         return entered and self.noisy(h).beyond_noise(before, held, least) > least
 
     def noisy(self, h: Hypothesis) -> Hypothesis:
@@ -266,7 +267,7 @@ class Known:
             self.entered[h] = noisy(h, self.task)
         return self.entered[h]
 
-    def little(self, h: Hypothesis, before: Hypothesis) -> bool:
+    def is_small(self, h: Hypothesis, before: Hypothesis) -> bool:
         """Whether a further cause removes no more than the form of the others may miss.
 
         What it removes of all that these remove is small then, and it leaves much of what they do.
@@ -275,10 +276,10 @@ class Known:
         few = h.share(before, self.root) <= limits.further
         return bool(before.causes) and few and h.leaves(before) > 1.0 - limits.enough
 
-    def slight(self, h: Hypothesis) -> tuple[str, ...]:
+    def small_causes(self, h: Hypothesis) -> tuple[str, ...]:
         """Name the causes that remove too little beside the others to be told from their form."""
-        less = {c.name: self.found.get(h.names - {c.name}) for c in h.causes}
-        return tuple(n for n, b in less.items() if b is not None and self.little(h, b))
+        less = {c.name: self.hypotheses.get(h.names - {c.name}) for c in h.causes}
+        return tuple(n for n, b in less.items() if b is not None and self.is_small(h, b))
 
     def remembers(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
         """Whether a cause with a memory that stays adds more than a static curve."""
@@ -295,7 +296,7 @@ class Known:
         """Whether an effect is none of the causes, nor bends the same curve as one of them."""
         if effect.name in {c.more_of for c in h.causes}:
             return False
-        groups = self.task.alike(self.root.fit)
+        groups = self.task.indistinguishable(self.root.fit)
         return not any(effect.name in g and h.names & set(g) for g in groups)
 
     def is_open(self, h: Hypothesis) -> bool:
