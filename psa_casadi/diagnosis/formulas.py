@@ -19,14 +19,9 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, size_at
 from psa_casadi.diagnosis.probes import tangents
-from psa_casadi.diagnosis.screening import (
-    independent,
-    whitened_jacobian,
-    whitened_residuals,
-    without,
-)
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -304,11 +299,11 @@ def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     others = [np.column_stack(part) for part in zip(*further, strict=True)]
     white = colour.whiten_all(np.column_stack(first), others)
     factors = np.array([known.get(trials[k], 0.0) for k in at])
-    target = whitened_residuals(fit, colour) + white @ (factors / sizes)
+    target = screening.whitened_residuals(fit, colour) + white @ (factors / sizes)
     kept = [n not in added for n in fit.unknowns.names]
     kept += [True] * (fit.unknowns.size - len(kept))
-    basis = independent(whitened_jacobian(fit, colour)[:, kept])
-    left, target = without(white, basis), without(target, basis)
+    basis = screening.independent(screening.whitened_jacobian(fit, colour)[:, kept])
+    left, target = screening.without(white, basis), screening.without(target, basis)
     new = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
     told = [trials[k] for k, q in zip(at, new, strict=True) if q]
     left, sizes = left[:, new], sizes[new]

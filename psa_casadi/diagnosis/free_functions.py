@@ -14,17 +14,12 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.corrections import FreeFunction, estimates
 from psa_casadi.diagnosis.formulas import Formula, Place, fitted, formula, place_of
 from psa_casadi.diagnosis.generic.attached import Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
-from psa_casadi.diagnosis.screening import (
-    independent,
-    whitened_jacobian,
-    whitened_residuals,
-    without,
-)
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
@@ -188,6 +183,8 @@ def _decrease(view: View, component: Component) -> float:
     moved = {p.name: p.typical(fit.model.values) for p in component.parameters}
     starts = tuple(fit.starts())
     columns, further = changes(fit, view.of.experiments, model, moved, starts, 0.0)
-    basis = independent(whitened_jacobian(fit, colour))
-    free = independent(without(colour.whiten_all(columns, further), basis))
-    return float(np.sum((free.T @ without(whitened_residuals(fit, colour), basis)) ** 2))
+    basis = screening.independent(screening.whitened_jacobian(fit, colour))
+    free = screening.independent(screening.without(colour.whiten_all(columns, further), basis))
+    return float(
+        np.sum((free.T @ screening.without(screening.whitened_residuals(fit, colour), basis)) ** 2)
+    )

@@ -178,15 +178,15 @@ def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, Fl
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
         rows = [views.Axis("temperature", "K", play.warming)]
-    items = [_view(axis, d) for axis in rows]
+    signatures = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
         axis, _ = views.hold_axis(record)
-        items.append(_view(axis, _since_it_began(axis.x, d)))
+        signatures.append(_view(axis, _since_it_began(axis.x, d)))
 
     def weight(row: tuple[views.View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
-    return max(items, key=weight)
+    return max(signatures, key=weight)
 
 
 def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, FloatArray]:
@@ -198,18 +198,18 @@ def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, Floa
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    observed = views.view(views.ground_of(residual, noise), axis)
+    seen = views.view(views.ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
-    if not observed.x.size:
-        return observed, coordinate, counted
-    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], observed.x))
-    left = counted[on] - np.interp(x, bins, observed.mean)
+    if not seen.x.size:
+        return seen, coordinate, counted
+    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], seen.x))
+    left = counted[on] - np.interp(x, bins, seen.mean)
     power = float(np.sum(d[there] ** 2))
     others = float(np.sum(d[there & ~on] ** 2))
     share = 1.0 - (float(np.sum(left**2)) + others) / power if power > 0 else 0.0
-    return replace(observed, share=max(0.0, share)), coordinate, counted
+    return replace(seen, share=max(0.0, share)), coordinate, counted
 
 
 def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
@@ -232,14 +232,7 @@ def _spectrum(time: FloatArray, d: FloatArray) -> views.View:
     peak = float(frequency[np.argmax(power)])
     band = np.abs(frequency - peak) <= max(_BAND * peak, 2.0 * frequency[1])
     share = float(np.sum(power[band]) / np.sum(power))
-    displayed = (frequency > 0) & (frequency < 20.0 * peak)
-    density: FloatArray = np.sqrt(2.0 * step * power / float(window @ window))
-    return views.View(
-        "spectrum",
-        "Hz",
-        frequency[displayed],
-        density[displayed],
-        np.zeros(int(displayed.sum())),
-        share,
-        True,
-    )
+    drawn = (frequency > 0) & (frequency < 20.0 * peak)
+    density = np.sqrt(2.0 * step * power / float(window @ window))[drawn]
+    none = np.zeros(density.size)
+    return views.View("spectrum", "Hz", frequency[drawn], density, none, share, True)

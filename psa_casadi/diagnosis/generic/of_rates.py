@@ -21,18 +21,8 @@ from psa_casadi.diagnosis.generic.attached import (
     size_of,
 )
 from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
+from psa_casadi.model import ports
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import (
-    Port,
-    definition_of,
-    is_place,
-    kinematics,
-    parameter_ports,
-    ports_of,
-    seen_by,
-    true_sum,
-    unit_of,
-)
 from psa_casadi.shapes import magnitude_power, signed_power, smooth_magnitude
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import rate_unit
@@ -54,7 +44,7 @@ class _Sum:
     """The sum at a port of a model, with the sizes of its signals and rates."""
 
     model: Model
-    port: Port
+    port: ports.Port
     sizes: Sizes
 
     @property
@@ -68,17 +58,21 @@ class _Sum:
 
     def range(self, x: str) -> Parameter:
         """Return the scale of a signal."""
-        return scale_of("range", self.sizes.signals[x], unit_of(self.model, x), x)
+        return scale_of("range", self.sizes.signals[x], self.unit(x), x)
+
+    def unit(self, x: str) -> str:
+        """Return the unit of a signal."""
+        return ports.unit_of(self.model, x)
 
 
-def sum_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
+def sum_effects(model: Model, port: ports.Port, sizes: Sizes) -> tuple[Attached, ...]:
     """Return what may be missing in the rate of a state, or in an intermediate.
 
     Of an intermediate, what is no coordinate may be lost by; a rate is lost by its own state.
     """
     at = _Sum(model, port, sizes)
     rate = [port.variable] if port.kind == "rate" else []
-    items = [n for n in seen_by(model, port) if n not in model.input_names]
+    items = [n for n in ports.seen_by(model, port) if n not in model.input_names]
     ways = [n for n in items if n not in rate and not _way(model, n)[1]]
     losing = rate or [n for n in items if n not in ways]
     # a hysteresis works along coordinates, else along all that is seen
@@ -90,19 +84,19 @@ def sum_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
     )
 
 
-def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[Port, ...]]:
+def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[ports.Port, ...]]:
     """Return how fast a state or a kinematic intermediate changes: a sum of symbols times numbers.
 
     And the rates among these. A coordinate has none: all are states.
     """
-    ports = {p.variable: p for p in ports_of(model) if p.kind == "rate"}
-    parts = kinematics(model).get(name, {name: 1.0})
-    speeds = {q: definition_of(model, q) for q in parts}
-    reads = tuple(ports[q] for q, speed in speeds.items() if speed is None)
-    return [(speeds[q] or ports[q].balance, factor) for q, factor in parts.items()], reads
+    rates = {p.variable: p for p in ports.ports_of(model) if p.kind == "rate"}
+    parts = ports.kinematics(model).get(name, {name: 1.0})
+    speeds = {q: ports.definition_of(model, q) for q in parts}
+    reads = tuple(rates[q] for q, speed in speeds.items() if speed is None)
+    return [(speeds[q] or rates[q].balance, factor) for q, factor in parts.items()], reads
 
 
-def _name(kind: str, port: Port, q: str) -> str:
+def _name(kind: str, port: ports.Port, q: str) -> str:
     itself = port.kind == "rate" and q == port.variable
     return f"{kind}_in_{q}" if itself else f"{kind}_of_{q}_in_{port.variable}"
 
@@ -152,7 +146,7 @@ def _friction(at: _Sum, v: str) -> Attached:
         parameters=(
             at.size("friction, as a rate", positive=at.port.kind == "rate"),
             Parameter(
-                "width", 0.02 * size, unit_of(at.model, v), (5e-4 * size, 0.7 * size),
+                "width", 0.02 * size, at.unit(v), (5e-4 * size, 0.7 * size),
                 f"{v} below which it fades", log=True, limit=True
             ),
         ),
@@ -211,7 +205,7 @@ def _stop(at: _Sum, x: str) -> Attached:
                 "size", 0.0, at.port.unit, (0.0, _STIFF * force),
                 "force of the stop, as a rate, at one range beyond it", scale=force,
             ),
-            level_of(0.8, (0.02, 2.0), size, unit_of(at.model, x)),
+            level_of(0.8, (0.02, 2.0), size, at.unit(x)),
             at.range(x),
         ),
         probe={"level": tuple(share * size for share in (0.5, 0.7, 0.85, 0.95))},
@@ -250,7 +244,7 @@ def _hysteresis(at: _Sum, x: str) -> Attached:
             Parameter("bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3),
             Parameter("n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True),
             at.range(x),
-            scale_of("rate", at.sizes.rates[x], rate_unit(unit_of(at.model, x)), f"rate of {x}"),
+            scale_of("rate", at.sizes.rates[x], rate_unit(at.unit(x)), f"rate of {x}"),
         ),
         states=(State("state", "1", "memory of the way", 0.5, memory=True, settles=False),),
         probe={"loss": (0.3, 1.0, 4.0, 16.0)},
@@ -263,17 +257,17 @@ def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return how every parameter and intermediate may change with states, inputs and time."""
     states = [q.name for c in model.components if c.gain is None for q in c.states]
     known = {i.name: i.unit for i in model.structure.inputs}
-    marked = [p for p in ports_of(model) if p.kind == "intermediate"]
+    marked = [p for p in ports.ports_of(model) if p.kind == "intermediate"]
     attacheds: list[Attached] = []
-    for port in (*parameter_ports(model), *marked):
-        attacheds += [_with(port, x, unit_of(model, x), sizes.signals[x]) for x in states]
+    for port in (*ports.parameter_ports(model), *marked):
+        attacheds += [_with(port, x, ports.unit_of(model, x), sizes.signals[x]) for x in states]
         attacheds += [_with(port, u, unit, sizes.signals[u]) for u, unit in known.items()]
         attacheds.append(_with(port, "time", "s", sizes.duration))
     return tuple(attacheds)
 
 
-def _with(port: Port, x: str, unit: str, size: float) -> Attached:
-    p = port.variable if port.kind == "parameter" else true_sum(port.variable)
+def _with(port: ports.Port, x: str, unit: str, size: float) -> Attached:
+    p = port.variable if port.kind == "parameter" else ports.true_sum(port.variable)
 
     def law(s: Symbols, item: Own) -> Expression:
         part = getattr(s, x) / item("range")
@@ -302,9 +296,9 @@ def _with(port: Port, x: str, unit: str, size: float) -> Attached:
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return every generic effect at every port of a model that has no effects yet."""
     result, imported = list[Attached](), bool(model.structure.foreign)
-    for port in ports_of(model):
+    for port in ports.ports_of(model):
         if port.kind != "rate":
             result += signal_effects(port, sizes, imported=imported)
-        if port.kind == "rate" or is_place(model, port):
+        if port.kind == "rate" or ports.is_place(model, port):
             result += sum_effects(model, port, sizes)
     return (*result, *changing(model, sizes))
