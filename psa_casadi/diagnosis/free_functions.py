@@ -185,6 +185,5 @@ def _decrease(view: View, component: Component) -> float:
     columns, further = changes(fit, view.of.experiments, model, moved, starts, 0.0)
     basis = screening.independent(screening.whitened_jacobian(fit, colour))
     free = screening.independent(screening.without(colour.whiten_all(columns, further), basis))
-    return float(
-        np.sum((free.T @ screening.without(screening.whitened_residuals(fit, colour), basis)) ** 2)
-    )
+    residual = screening.without(screening.whitened_residuals(fit, colour), basis)
+    return float(np.sum((free.T @ residual) ** 2))

@@ -87,20 +87,20 @@ _HOLD, _RATES, _SIZES = 3.0, 2, 3
 def next_experiment(
     causes: Sequence[Cause],
     verdict: Verdict,
-    texts: Sequence[Sequence[str]],
+    groups: Sequence[Sequence[str]],
     records: Sequence[Record],
     *,
     doubted: bool,
 ) -> NextExperiment:
-    """Return what to do next; `texts` are groups of effects that only a resonance tells apart."""
+    """Return what to do next; `groups` are effects that only a resonance tells apart."""
     if verdict == "not_driven":
         return NextExperiment(None, (), (note("correct_columns"),))
     if doubted:
         return NextExperiment(None, (), (note("record_again"),))
     open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
-    rivals = tuple(dict.fromkeys(n for item in open_ones for n in item))
-    same = [item for item in open_ones if any(set(item) <= set(group) for group in texts)]
-    steps = [note("same_curve", effects=item) for item in same]
+    rivals = tuple(dict.fromkeys(n for effects in open_ones for n in effects))
+    same = [effects for effects in open_ones if any(set(effects) <= set(g) for g in groups)]
+    steps = [note("same_curve", effects=effects) for effects in same]
     if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
         steps.append(useful_records(records))
     if steps:
@@ -312,7 +312,7 @@ class StackJudge(Judge):
         both = self.first.predicted, final.predicted
         misfits = _misfits(experiments, self.missed_errors, self.floors)
         records = [e.record for e in experiments]
-        texts = same_curves(experiments, self.task.table, self.first.fit)
+        groups = same_curves(experiments, self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
         base, extended = (held_out.errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
@@ -332,7 +332,7 @@ class StackJudge(Judge):
             gain=held_out.gain_of(experiments, *both),
             blind_to=blind_spots(self.steps, final, self.task.table, limits),
             next_experiment=next_experiment(
-                self.causes, self.verdict, texts, records, doubted=self.doubt is not None
+                self.causes, self.verdict, groups, records, doubted=self.doubt is not None
             ),
             remarks=(*self.model.provenance.notes, *self.remarks, *coverage_notes(experiments)),
             experiments=tuple(experiments),
