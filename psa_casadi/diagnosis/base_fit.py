@@ -341,7 +341,7 @@ def _with_masses(
     """
     least = min(least, before.rms * float(np.exp(-_CLEAR / len(before.residuals))))
 
-    def begun(start: Mapping[str, float]) -> Fit | None:
+    def fit_from(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
         return quick_from(
             before, before.model, experiments, free,
@@ -355,7 +355,7 @@ def _with_masses(
         )  # fmt: skip
 
     limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
-    items = [f for f in side_by_side(begun, starts) if f is not None and f.cost < limit]
+    items = [f for f in side_by_side(fit_from, starts) if f is not None and f.cost < limit]
     ended = side_by_side(further, sorted(items, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:

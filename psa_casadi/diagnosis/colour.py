@@ -28,7 +28,7 @@ class Colour:
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
     records' numbers of samples. `further` are the colours of the columns beside the displacement,
     each with a level in its own unit. The first samples of a record count over the noise's rms, or
-    with 0 where a record does not say how it `begins`; every sample over its `spread` (samples,),
+    with 0 where a record has no `known_start`; every sample over its `spread` (samples,),
     where the noise is not as large everywhere.
     """
 
@@ -36,7 +36,7 @@ class Colour:
     level: float
     lengths: tuple[int, ...]
     further: tuple["Colour", ...] = ()
-    begins: bool = True
+    known_start: bool = True
     spread: FloatArray | None = None
 
     @property
@@ -71,15 +71,14 @@ class Colour:
         """Filter a signal (samples,) or columns (samples, k), every record for itself."""
         if not signal.size or (self.spread is None and not any(map(len, self.autoregression))):
             return signal
-        white = signal.copy()
-        first = 0
+        white, first = signal.copy(), 0
         records = zip(self.autoregression, self._powers, self.lengths, strict=True)
         for a, power, length in records:
             part = signal[first : first + length]
             if a.size and length > a.size:
                 item = white[first : first + length]
                 item[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                item[: a.size] = self.begins * part[: a.size] / np.sqrt(power)
+                item[: a.size] = self.known_start * part[: a.size] / np.sqrt(power)
             first += length
         if self.spread is not None:
             white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))
@@ -92,11 +91,9 @@ class Colour:
         """
         if not further:
             return self.whiten(signal)
-        items = [
-            self.level / item.level * item.whiten(part)
-            for item, part in zip(self.further, further, strict=True)
-        ]
-        return np.concatenate([self.whiten(signal), *items])
+        pairs = zip(self.further, further, strict=True)
+        others = [self.level / c.level * c.whiten(part) for c, part in pairs]
+        return np.concatenate([self.whiten(signal), *others])
 
 
 def colour_of(
@@ -155,8 +152,7 @@ def _correlated(r: float, columns: FloatArray) -> FloatArray:
     """Return S q for columns q: their sum over all samples, weighted with r^|i-j|."""
     ahead = filtered([1.0], [1.0, -r], columns)
     behind = filtered([1.0], [1.0, -r], columns[::-1])[::-1]
-    both: FloatArray = ahead + behind - columns
-    return both
+    return ahead + behind - columns
 
 
 def _beside(columns: FloatArray) -> FloatArray:
@@ -185,9 +181,8 @@ def _before(value: float, removed: Sequence[FloatArray]) -> float:
             break
         item.append(r)
         left.append(more)
-    return (
-        float(np.interp(value, left, item)) + min(0.0, value - left[0]) + max(0.0, value - left[-1])
-    )
+    beyond = min(0.0, value - left[0]), max(0.0, value - left[-1])
+    return float(np.interp(value, left, item)) + beyond[0] + beyond[1]
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:

@@ -8,7 +8,7 @@ import scipy
 
 from psa_casadi.diagnosis.colour import rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
-from psa_casadi.diagnosis.noise import NoiseFloor, knowable_of
+from psa_casadi.diagnosis.noise import NoiseFloor, detection_limit_of
 from psa_casadi.diagnosis.own_colour import OwnColour
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
@@ -113,7 +113,7 @@ def held_out_excess(
     if worst > max(limits.unseen_ratio_of_records, excess.factor):
         excess = Excess(worst, limits.unseen_alarm)
     size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / excess.factor**2))
-    return excess if size > knowable_of(fit, experiments, limits) else Excess()
+    return excess if size > detection_limit_of(fit, experiments, limits) else Excess()
 
 
 def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:

@@ -20,6 +20,7 @@ Stops and plays: Visintin 1994; their squares and cubes make loops that are asym
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -30,9 +31,10 @@ from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
 from psa_casadi.diagnosis.screening import independent, temperature, without
 from psa_casadi.diagnosis.task import LIMITS, Thresholds, shows_ringing
-from psa_casadi.effects.patches import BRANCH, CURVE, ELEMENTS, NARROW, radius
-from psa_casadi.errors import PsaError
-from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.effects import patches
+from psa_casadi.errors import InputError, PsaError
+from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.refitting import POLISH
 from psa_casadi.identification.start.linear_response import plays
 from psa_casadi.model.compose import Model
 from psa_casadi.notes import Note, note
@@ -40,6 +42,7 @@ from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import linear_part
+from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.units import FloatArray
 
 #: Relaxations per decade, modes.
@@ -83,8 +86,7 @@ class Kind:
 
 
 def _over_range(values: FloatArray, every: Sequence[FloatArray]) -> FloatArray:
-    low = min(float(np.min(v)) for v in every)
-    high = max(float(np.max(v)) for v in every)
+    low, high = min(float(np.min(v)) for v in every), max(float(np.max(v)) for v in every)
     return (values - low) / max(high - low, 1e-300)
 
 
@@ -94,13 +96,13 @@ def _cosines(q: FloatArray, first: int, count: int) -> FloatArray:
 
 def _direction(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
-    side = (q[:, None] - plays(q, [NARROW])) / NARROW
-    return s.respond(k, side * _cosines(q, 0, BRANCH))
+    side = (q[:, None] - plays(q, [patches.NARROW])) / patches.NARROW
+    return s.respond(k, side * _cosines(q, 0, patches.BRANCH))
 
 
 def _memory(s: Signals, k: int) -> FloatArray:
     q = s.voltage(k)
-    radii = np.array([radius(k) for k in range(ELEMENTS)])
+    radii = np.array([patches.radius(k) for k in range(patches.ELEMENTS)])
     followed = plays(q, radii)
     return s.respond(k, np.hstack([q[:, None] - followed, followed**2, followed**3]))
 
@@ -118,8 +120,7 @@ def time_constants(records: Sequence[Record]) -> FloatArray:
     shortest = min(r.sample_time for r in records)
     longest = _LONGEST * max(r.duration for r in records)
     count = max(2, round(_PER_DECADE * float(np.log10(longest / shortest))))
-    values: FloatArray = np.geomspace(shortest, longest, count)
-    return values
+    return np.geomspace(shortest, longest, count)
 
 
 def _modes(s: Signals, k: int) -> FloatArray:
@@ -138,7 +139,7 @@ def _modes(s: Signals, k: int) -> FloatArray:
 
 def _time(s: Signals, k: int) -> FloatArray:
     t = s.experiments[k].record.time
-    return _cosines((t - t[0]) / (t[-1] - t[0]), 1, BRANCH)
+    return _cosines((t - t[0]) / (t[-1] - t[0]), 1, patches.BRANCH)
 
 
 def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
@@ -167,10 +168,10 @@ def _smooth(count: int) -> FloatArray:
 
 KINDS = (
     Kind("curve", "drive voltage",
-         lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, CURVE)), _smooth),
-    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, CURVE), _smooth),
+         lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, patches.CURVE)), _smooth),
+    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, patches.CURVE), _smooth),
     Kind("curve", "force",
-         lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, CURVE)), _smooth, fast=True),
+         lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, patches.CURVE)), _smooth, True),
     Kind("direction", "force", _direction, _smooth),
     Kind("memory", "force", _memory, _flat),
     Kind("relaxation", "force", _relaxation, _flat),
@@ -231,10 +232,10 @@ class Correction:
     @property
     def sentence(self) -> str:
         """What it is in words."""
-        return str(self.said)
+        return str(self.label)
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         raise NotImplementedError
 
@@ -258,7 +259,7 @@ class Patch(Correction):
         return f"{self.kind} at the {self.port}"
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         return note("correction", kind=self.kind, port=self.port)
 
@@ -300,7 +301,7 @@ class FreeFunction(Correction):
         return f"a free function of {self.of} in {self.port}"
 
     @property
-    def said(self) -> Note:
+    def label(self) -> Note:
         """What it is."""
         return note("free", of=self.of, port=self.port, equation=self.equation)
 
@@ -325,15 +326,14 @@ def best_of(
     """
     samples = [sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in range(len(held))]
 
-    def gained(c: Correction) -> float:
-        rows = zip(samples, colour.each, held, c.held, strict=False)
-        return sum(
-            n / item.inflation * float(np.log(before / max(after, 1e-300)))
-            for n, item, before, after in rows
-        )
+    counts = [n / c.inflation for n, c in zip(samples, colour.each, strict=False)]
 
-    items = [c for c in result if c.evidence > limits.price]
-    good = [c for c in items if not any(samples) or gained(c) > limits.held_out]
+    def gained(c: Correction) -> float:
+        rows = zip(counts, held, c.held, strict=False)
+        return sum(n * float(np.log(before / max(after, 1e-300))) for n, before, after in rows)
+
+    likely = [c for c in result if c.evidence > limits.price]
+    good = [c for c in likely if not any(samples) or gained(c) > limits.held_out]
     if not good:
         return None
     best = max(good, key=lambda c: c.evidence)
@@ -375,14 +375,13 @@ class _Following:
         scaled = used[:, self.free] * self.prior
         self.white = np.vstack([self.over_noise(scaled), self.held])
         self.basis = independent(self.white)
-        self.target = self.beside(fit.residuals)
+        self.target = self.orthogonal(fit.residuals)
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
         """Return columns at the used samples, whitened, over the noise."""
-        white: FloatArray = self.colour.whiten(columns) / self.colour.level
-        return white
+        return self.colour.whiten(columns) / self.colour.level
 
-    def beside(self, columns: FloatArray) -> FloatArray:
+    def orthogonal(self, columns: FloatArray) -> FloatArray:
         """Return columns over the noise, whitened, less what the parameters can follow."""
         none = np.zeros((len(self.held), *columns.shape[1:]))
         return without(np.concatenate([self.over_noise(columns), none]), self.basis)
@@ -400,7 +399,7 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
-    free = follow.beside(used)
+    free = follow.orthogonal(used)
     weights, evidence = _weights(free, follow.target)
     item = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
@@ -433,9 +432,8 @@ def _weights(columns: FloatArray, target: FloatArray) -> tuple[FloatArray, float
         ratio = (size / largest) ** 2 * n
         shrunk = ratio * singular**2 / (1.0 + ratio * singular**2)
         left = power - float(np.sum(shrunk * along**2))
-        log_ratio = -0.5 * n * np.log(left / power) - 0.5 * float(
-            np.sum(np.log1p(ratio * singular**2))
-        )
+        spent = 0.5 * float(np.sum(np.log1p(ratio * singular**2)))
+        log_ratio = -0.5 * n * np.log(left / power) - spent
         if log_ratio > best[0]:
             with np.errstate(divide="ignore", invalid="ignore"):
                 scaled = np.where(singular > 1e-12 * largest, shrunk / singular, 0.0) * along
@@ -472,3 +470,66 @@ def responses(
         return np.asarray(out[pad : pad + n])
 
     return respond
+
+
+def with_patch(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Fit:
+    """Return a fit with the correction beside the model, begun with the weights that it has.
+
+    The model's own values begin where they follow the correction, and where they were.
+
+    `predicted` [m] are the predictions of `before`. Raises InputError for a kind that no component
+    stands for, SimulationError where it cannot be simulated.
+    """
+    component = patches.PATCHES.get((patch.kind, patch.port))
+    if component is None:
+        raise InputError(
+            f"The unnamed correction ({patch.name}) has no form that a model could hold; the page"
+            " shows it, and a further mode of the table is the nearest that can be fitted."
+        )
+    numbers = _numbers(before, patch, experiments, predicted)
+    names = [patches.weight(k + 1) for k in range(len(patch.weights))]
+    values = {**numbers, patches.GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
+
+    def fit_from(theta: FloatArray) -> Fit:
+        unknowns = before.unknowns
+        return fit(
+            before.model.with_effect(component, {**values, **unknowns.values(theta)}),
+            experiments,
+            [*unknowns.names, *names],
+            sigma=before.sigma,
+            start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
+            evaluations=POLISH,
+        )
+
+    items = []
+    for theta in (before.theta + patch.moved, before.theta):
+        with suppress(SimulationError):
+            items.append(fit_from(theta))
+    if not items:
+        raise SimulationError("The model cannot be simulated with the unnamed correction.")
+    return min(items, key=lambda f: f.cost)
+
+
+def _numbers(
+    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
+) -> Mapping[str, float]:
+    """Return the parameters that are not fitted: the range, times."""
+    records = [e.record for e in experiments]
+    longest = max(r.duration for r in records)
+    if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
+        every = np.concatenate([r.voltage for r in records])
+    else:
+        every = np.concatenate([y - before.offset(k) for k, y in enumerate(predicted)])
+    numbers = {"patch_low": float(np.min(every)), "patch_high": float(np.max(every))}
+    if patch.kind == "time":
+        return {"patch_time": longest}
+    if patch.kind == "gain in time":
+        return {**numbers, "patch_time": longest}
+    if patch.kind == "relaxation":
+        taus = time_constants(records)
+        if len(taus) > patches.RELAXATIONS:
+            raise InputError("The records span more decades of time than a correction can hold.")
+        return {**numbers, "patch_time": float(taus[0]), "patch_ratio": float(taus[1] / taus[0])}
+    return numbers

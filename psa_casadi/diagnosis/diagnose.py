@@ -8,7 +8,7 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.base_fit import from_resonances
-from psa_casadi.diagnosis.judgement import NAMING, told_from
+from psa_casadi.diagnosis.judgement import NAMING, indistinguishable
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.probes import laws_of, screened_with
@@ -35,16 +35,7 @@ from psa_casadi.identification.search import (
     search_forms,
     without_column,
 )
-from psa_casadi.identification.start.doubts import (
-    correlation,
-    doubtful_quantity,
-    doubtful_time,
-    doubtful_unit,
-    doubtful_voltage,
-    refuse_few,
-    refuse_stuck,
-    refuse_unreadable,
-)
+from psa_casadi.identification.start import doubts
 from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.interruption import interruptible_work
@@ -52,6 +43,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.progress import Progress, silent
+from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order, without_gaps
@@ -88,27 +80,25 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
         base = from_resonances(base, experiments, progress) or base
     share = explained(base, experiments)
     records = [e.record for e in experiments]
-    doubts = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_quantity)
-    notes = tuple(s for doubt in doubts if (s := doubt(records)))
-    if share >= limits.follows and correlation(records) > limits.falling:
+    tests = (doubts.doubtful_unit, doubts.doubtful_voltage, doubts.doubtful_time)
+    notes = tuple(s for t in (*tests, doubts.doubtful_quantity) if (s := t(records)))
+    if share >= limits.follows and doubts.correlation(records) > limits.falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with flipped sign")
-    turned = [
-        replace(e, record=replace(e.record, displacement=-measured(e.record))) for e in experiments
-    ]
-    other, displayed = 0.0, max(share, 0.0)
+    flipped = [replace(r, displacement=-measured(r)) for r in records]
+    turned = [replace(e, record=r) for e, r in zip(experiments, flipped, strict=True)]
+    other, positive = 0.0, max(share, 0.0)
     with suppress(PsaError):
         other = explained(fit_base(model, turned), turned)
     if other > max(share, limits.follows):
-        return Driven(False, (note("flipped", flipped=other, share=displayed), *notes))
-    if share < limits.follows:
-        linear = filtered(experiments)
-        if linear > limits.follows:
-            return Driven(False, (note("filtered", linear=linear, share=displayed), *notes), True)
-        quantity = doubtful_quantity(records)
-        statement = note("not_driven", share=displayed)
-        return Driven(False, (statement, quantity) if quantity else (statement,))
-    return Driven(follows=True, notes=notes)
+        return Driven(False, (note("flipped", flipped=other, share=positive), *notes))
+    if share >= limits.follows:
+        return Driven(follows=True, notes=notes)
+    linear = filtered(experiments)
+    if linear > limits.follows:
+        return Driven(False, (note("filtered", linear=linear, share=positive), *notes), True)
+    quantity = doubts.doubtful_quantity(records)
+    return Driven(False, (note("not_driven", share=positive), *([quantity] if quantity else [])))
 
 
 def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
@@ -163,7 +153,7 @@ _PLACES = ("drive", "sensor", "plant", "environment")
 _RIVAL = 0.01
 
 
-def decisions(
+def column_decisions(
     steps: Sequence[Step],
     task: Task,
     table: Sequence[Component],
@@ -180,7 +170,7 @@ def decisions(
     if is_measured(experiments):
         columns.append(LOAD)
     first, last, colour = steps[0].view.of, steps[-1].view.of, steps[-1].screening.colour
-    items = []
+    decisions = []
     for column in columns:
         task.progress(f"the same without {column}")
         effects = task.table
@@ -188,14 +178,12 @@ def decisions(
             effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
         apart = without_column(experiments, column)
         alone = Task(apart, effects, STACK, task.method, task.progress, hidden=task.hidden)
-        now, then = (
-            _named(steps, task.limits) if verdict in NAMING else {},
-            _named(search(alone), task.limits),
-        )
+        now = _named(steps, task.limits) if verdict in NAMING else {}
+        then = _named(search(alone), task.limits)
         k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
         gained = further_gains(first.fit, last.fit, colour).get(column, 0.0)
-        item = {e.name: e for e in effects}
-        items.append(
+        by_name = {e.name: e for e in effects}
+        decisions.append(
             Decision(
                 column=column,
                 role="input" if k is None else "output",
@@ -207,19 +195,17 @@ def decisions(
                 named_without=then,
                 ruled_out=tuple(n for n in then if n not in now),
                 evidence=gained,
-                outcome=decided(column, now, then, gained, item, clear=verdict == "adequate"),
+                outcome=decided(column, now, then, gained, by_name, clear=verdict == "adequate"),
             )
         )
-    return tuple(items)
+    return tuple(decisions)
 
 
 def _named(steps: Sequence[Step], limits: Thresholds) -> dict[str, float]:
     """Return the named set of every cause, with the probability of each effect."""
     values: dict[str, float] = {}
-    for step in steps:
-        if step.chosen is None:
-            continue
-        for name in (step.cause.name, *told_from(step, limits)):
+    for step in steps[:-1]:
+        for name in (step.cause.name, *indistinguishable(step, limits)):
             if step.probability.get(name, 0.0) >= _RIVAL:
                 values.setdefault(name, step.probability[name])
     return values
@@ -296,7 +282,7 @@ def diagnose(
     hypothesis of the search (`Tried`). Raises InputError, and DiagnosisInterrupted with the best
     model so far at a keyboard interrupt once there is one.
     """
-    method, device = method or Method(), (model, stiffness, hysteresis)
+    method = method or Method()
     inputs, kept = records_given(records), records_given(holdout)
     sound, since = records_given(reference), None
     if sound:
@@ -306,89 +292,71 @@ def diagnose(
         progress("what the reference leaves open")
         since = Healthy(known.fit, known.experiments).since([*inputs, *kept])
         inputs, kept = since.taken_off(len(inputs))
-        method, device = since.method(method), (known.model, stiffness, hysteresis)
-    return _diagnosed((inputs, kept), device, effects, (method, progress, watch), since)
-
-
-def _diagnosed(
-    records: tuple[Sequence[Record], Sequence[Record]],
-    device: tuple[Model | None, float | None, Hysteresis | None],
-    effects: Sequence[Component] | None,
-    work: tuple[Method, Progress, Callable[[Tried], None]],
-    since: Since | None,
-) -> StackDiagnosis:
-    """Diagnose records and held-out ones of a device, by a method.
-
-    `device` are model, stiffness and hysteresis as `diagnose` takes them, `work` are method,
-    progress and watch; `since` is what is known of healthy records.
-    """
-    (inputs, kept), (model, stiffness, hysteresis), (method, progress, watch) = (
-        records,
-        device,
-        work,
-    )
-    with stage("preparing"):
-        table = list(effects if effects is not None else known_effects().values())
-        (whole, cut), (held, cut_too) = without_gaps(inputs), without_gaps(kept)
-        ordered, apart = in_one_order(whole), in_one_order(held)
-        clean, statement, hidden = _cleaned(ordered)
-        statement += [*cut, *cut_too]
-        judged = [cleaned(r) for r in apart]
-        if "one clock" not in method.without:
-            clean, judged = _on_one_clock(clean, statement), _on_one_clock(judged, statement)
-        (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
-        start, scale_given = chosen_start(clean, model, stiffness)
-        (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
-        statement += [*means, *means_too, *long, *long_too]
-        experiments = divided(clean, judged)
-        columns = columns_of(start, [e.record for e in experiments])
-        experiments = with_levels(experiments, columns.fitted)
-        forms, best, why = forms_of(columns.model, hysteresis), None, None
-        if forms[1:]:
-            best, why = search_forms(forms, experiments, progress=progress)
-        start = next(m for m in forms if not best or m.components == best.best.model.components)
-        refuse_stuck([e.record for e in experiments])
-        known = {e.name for e in table}
-        searched = (*table, *(c for c in start.effects if c.more_of in known))
-        start = start.without(c.name for c in searched if c.gain is not None)
-        there = {c.name for c in start.components}
-        table = [e for e in table if set(e.needs) <= there and _recorded(e, experiments)]
-        statement += [*columns.left_out, *([why] if why else [])]
+        method, model = since.method(method), known.model
     so_far: list[Fit] = []
-    task = Task(
-        experiments,
-        tuple(table),
-        STACK,
-        method,
-        progress,
-        so_far.append,
-        watch,
-        hidden=hidden,
-        free=() if since else None,
-    )
+    with stage("preparing"):
+        (whole, cut), (held, cut_too) = without_gaps(inputs), without_gaps(kept)
+        ordered = in_one_order(whole)
+        table = tuple(effects if effects is not None else known_effects().values())
+        free = () if since else None
+        task = Task((), table, STACK, method, progress, so_far.append, watch, free=free)
+        start, task, scale_given, notes = _prepared(
+            ordered, in_one_order(held), [*cut, *cut_too], task, model, stiffness, hysteresis
+        )
     try:
-        laws = laws_of(start, [e.record for e in experiments if e.stop], table)
+        laws = laws_of(start, [e.record for e in task.experiments if e.stop], task.table)
         # from the end: the screening begins at the front
-        with compiled_ahead(reversed(screened_with(start, table, laws))):
-            stack_diagnosis = _against(since, start, task, scale_given)
-        return _with_noise(stack_diagnosis, statement, (*whole, *held))
+        with compiled_ahead(reversed(screened_with(start, task.table, laws))):
+            result = _against(since, start, task, scale_given)
+        noise: tuple[NoiseFound, ...] = ()
+        if result.verdict != "not_driven":
+            noise = noise_found(result.extended_fit, result.experiments, (*whole, *held))
+        return result.with_noise(noise, notes)
     except KeyboardInterrupt:
         if not so_far:
             raise
         raise DiagnosisInterrupted(unfinished(so_far[-1], ordered, scale_given)) from None
 
 
-def _with_noise(
-    stack_diagnosis: StackDiagnosis, statement: Sequence[Note | str], records: Sequence[Record]
-) -> StackDiagnosis:
-    """Return a diagnosis with further notes, and the noise that its extended model leaves."""
-    driven = stack_diagnosis.verdict != "not_driven"
-    noise = (
-        noise_found(stack_diagnosis.extended_fit, stack_diagnosis.experiments, records)
-        if driven
-        else ()
-    )
-    return stack_diagnosis.with_noise(noise, statement)
+def _prepared(
+    records: Sequence[Record],
+    kept: Sequence[Record],
+    cut: Sequence[str],
+    task: Task,
+    model: Model | None,
+    stiffness: float | None,
+    hysteresis: Hysteresis | None,
+) -> tuple[Model, Task, bool, list[Note | str]]:
+    """Return where the base fit starts, the task with its experiments, and notes on the records.
+
+    And whether the force scale is given; `kept` are records that are held out, `cut` the notes on
+    their gaps. Raises InputError.
+    """
+    clean, notes, hidden = _cleaned(records)
+    notes += cut
+    judged = [cleaned(r) for r in kept]
+    if "one clock" not in task.method.without:
+        clean, judged = _on_one_clock(clean, notes), _on_one_clock(judged, notes)
+    (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
+    start, scale_given = chosen_start(clean, model, stiffness)
+    (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
+    experiments = divided(clean, judged)
+    columns = columns_of(start, [e.record for e in experiments])
+    notes += [*means, *means_too, *long, *long_too, *columns.left_out]
+    experiments = with_levels(experiments, columns.fitted)
+    start, *forms = forms_of(columns.model, hysteresis)
+    if forms:
+        best, why = search_forms((start, *forms), experiments, progress=task.progress)
+        notes += [why] if why else []
+        start = next(m for m in (start, *forms) if m.components == best.best.model.components)
+    doubts.refuse_stuck([e.record for e in experiments])
+    known = {e.name for e in task.table}
+    searched = (*task.table, *(c for c in start.effects if c.more_of in known))
+    start = start.without(c.name for c in searched if c.gain is not None)
+    there = {c.name for c in start.components}
+    table = (e for e in task.table if set(e.needs) <= there and _recorded(e, experiments))
+    task = replace(task, experiments=experiments, table=tuple(table), hidden=hidden)
+    return start, task, scale_given, notes
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -398,22 +366,20 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
 
     Raises InputError where hardly a sample is left.
     """
-    refuse_unreadable(records)
-    items = [suspects(r) for r in records]
-    clean = [cleaned(r, s) for r, s in zip(records, items, strict=True)]
-    saturation = tuple(
-        s for r, item in zip(records, items, strict=True) for s in item.saturation(r.name)
-    )
-    refuse_few(records, clean, texts(saturation))
-    statement: list[Note | str] = [*saturation]
-    saturated = sum(item.counts["saturated"] for item in items)
-    return clean, statement, saturated / max(1, sum(int(r.mask.sum()) for r in records))
+    doubts.refuse_unreadable(records)
+    pairs = [(r, suspects(r)) for r in records]
+    clean = [masked(r, s) for r, s in pairs]
+    saturation = tuple(n for r, s in pairs for n in s.saturation(r.name))
+    doubts.refuse_few(records, clean, texts(saturation))
+    saturated = sum(s.counts["saturated"] for _, s in pairs)
+    share = saturated / max(1, sum(int(r.mask.sum()) for r in records))
+    return clean, [*saturation], share
 
 
-def _on_one_clock(records: Sequence[Record], statement: list[Note | str]) -> list[Record]:
-    """Return the records with their readings on one clock; `statement` gets what is done."""
+def _on_one_clock(records: Sequence[Record], notes: list[Note | str]) -> list[Record]:
+    """Return the records with their readings on one clock; `notes` gets what is done."""
     done = [on_one_clock(r) for r in records]
-    statement += [s for _, item in done for s in item]
+    notes += [s for _, statements in done for s in statements]
     return [r for r, _ in done]
 
 
@@ -438,20 +404,19 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     base, task = _base(start, task)
     experiments, stuck = without_stuck_readings(task.experiments, base)
     if stuck:
-        refuse_stuck([e.record for e in experiments])
+        doubts.refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
     read: list[Note] = []
     base, task = _on_even_clock(base, start, task, read)
     experiments = task.experiments
-    observed = driven(base, start, task)
-    if not observed.follows:
-        steps = unsearched(base, task)
-        result = StackJudge(
-            steps, task, scale_given=scale_given, driven=observed.filtered
-        ).conclude()
-        return replace(result, remarks=(*result.remarks, *observed.notes))
-    steps = steps_of(best_first(base, task), task)
-    task.keep(steps[-1].fit)
+    following = driven(base, start, task)
+    if not following.follows:
+        judge = StackJudge(
+            unsearched(base, task), task, scale_given=scale_given, driven=following.filtered
+        )
+        result = judge.conclude()
+        return replace(result, remarks=(*result.remarks, *following.notes))
+    steps = _steps(base, task)
     fewer, more = without_stuck_readings(experiments, steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
         stuck += more
@@ -460,14 +425,13 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
     steps, task = _between_samples(steps, start, task, read)
     progress("judging")
     result = StackJudge(steps, task, scale_given=scale_given).conclude()
-    decided = decisions(
+    columns = column_decisions(
         steps, task, every, lambda other: _searched(start, other)[0], result.verdict
     )
-    result = replace(result, columns=decided)
     read += [note("stuck", count=stuck)] if stuck else []
     turned = [n for f in steps[0].fit.further for n in f.turned]
-    output = *observed.notes, *read, *turned, *steps[-1].remarks
-    return replace(result, remarks=(*result.remarks, *output))
+    remarks = *result.remarks, *following.notes, *read, *turned, *steps[-1].remarks
+    return replace(result, columns=columns, remarks=remarks)
 
 
 def _on_even_clock(base: Fit, start: Model, task: Task, notes: list[Note]) -> tuple[Fit, Task]:
@@ -515,9 +479,14 @@ def _base(start: Model, task: Task) -> tuple[Fit, Task]:
 def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:
     """Fit the base and search; return the steps, and the task with its columns' levels."""
     base, task = _base(start, task)
-    steps = steps_of(best_first(base, task), task)
+    return _steps(base, task), task
+
+
+def _steps(base: Fit, task: Task) -> list[Step]:
+    """Search from a base fit and keep the best."""
+    steps = steps_of(best_first(base, task))
     task.keep(steps[-1].fit)
-    return steps, task
+    return steps
 
 
 def _recorded(effect: Component, experiments: Sequence[Experiment]) -> bool:

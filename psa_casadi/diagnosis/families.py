@@ -48,14 +48,14 @@ def place_and_kind(c: Correction) -> tuple[str, str]:
 
 
 @dataclass(frozen=True)
-class Shown:
+class CauseEvidence:
     """What a cause has: its evidence E [nats], from n samples, beside which k causes with it."""
 
     evidence: float
     samples: int
     causes: int = 1
 
-    def known(self, limits: Thresholds) -> float:
+    def listed_probability(self, limits: Thresholds) -> float:
         """Return the probability that it is of any kind that was tried.
 
         The odds of what looks like it, but nobody has thought of or is the form of another cause,
@@ -68,14 +68,14 @@ class Shown:
 def families(
     probability: Mapping[str, float],
     places: Mapping[str, tuple[str, str]],
-    displayed: Shown,
+    shown: CauseEvidence,
     corrections: Sequence[Correction],
     limits: Thresholds,
 ) -> tuple[Family, ...]:
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; what is `displayed` of the cause is over the model without it, beside which the
+    families; what is `shown` of the cause is over the model without it, beside which the
     `corrections` stand. With the evidence F_k, above the price of a cause, of each correction and
     that E of the cause, the odds that it is not listed are
 
@@ -85,9 +85,9 @@ def families(
     One of its kind has more freedom: it counts where `enough` of its F is more than E.
     Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
     lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
-    missing to 1 is of no kind that was tried (`Shown.known`).
+    missing to 1 is of no kind that was tried (`CauseEvidence.listed_probability`).
     """
-    evidence = displayed.evidence
+    evidence = shown.evidence
     form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
     item = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
@@ -100,7 +100,7 @@ def families(
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     odds_of_all = bool(probability) + sum(others.values())
-    listed = displayed.known(limits) / odds_of_all if odds_of_all else 0.0
+    listed = shown.listed_probability(limits) / odds_of_all if odds_of_all else 0.0
     table: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:

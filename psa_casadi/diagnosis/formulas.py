@@ -19,21 +19,15 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, size_at
 from psa_casadi.diagnosis.probes import tangents
-from psa_casadi.diagnosis.screening import (
-    independent,
-    whitened_jacobian,
-    whitened_residuals,
-    without,
-)
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import refit, weighted
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, true_sum, unit_of, variables_at
-from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import FloatArray, per
 from psa_casadi.variables import Parameter
@@ -178,15 +172,12 @@ class Place:
 def place_of(model: Model, port: Port, sizes: Sizes) -> Place:
     """Return a port with what a formula at it may be of."""
     names = variables_at(model, port)[:_VARIABLES]
-    item = (port.variable,) if port.kind in ("output", "intermediate") else ()
-    return Place(
-        port,
-        names,
-        {n: true_sum(n) if n in item else n for n in (*names, *item)},
-        {n: sizes.signals[n] for n in (*names, *item)},
-        {n: port.unit if n in item else unit_of(model, n) for n in (*names, *item)},
-        size_at(port, sizes),
-    )
+    itself = (port.variable,) if port.kind in ("output", "intermediate") else ()
+    every = (*names, *itself)
+    symbols = {n: true_sum(n) if n in itself else n for n in every}
+    units = {n: port.unit if n in itself else unit_of(model, n) for n in every}
+    magnitudes = {n: sizes.signals[n] for n in every}
+    return Place(port, names, symbols, magnitudes, units, size_at(port, sizes))
 
 
 #: A term, the h in it, and its factor.
@@ -228,7 +219,7 @@ class Formula:
 
 def fitted(
     of: Hypothesis, begin: Fit, component: Component, terms: Sequence[Term],
-    experiments: Sequence[Experiment], start: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | None = None,
 ) -> Formula | None:  # fmt: skip
     """Return a sum of terms beside a hypothesis, all free, from where a fit stands.
 
@@ -238,46 +229,40 @@ def fitted(
     kept = {n: v for n, v in values.items() if n in of.fit.model.values}
     model = of.fit.model.with_values(kept).with_effect(component, start)
     fit = refit(
-        replace(begin, model=model), weighted(of.fit, experiments),
+        replace(begin, model=model), weighted(of.fit, of.experiments),
         [*of.fit.unknowns.names, *component.fitted],
         sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
     )  # fmt: skip
-    result = hypothesis((*of.causes, component), fit, experiments)
+    result = hypothesis((*of.causes, component), fit, of.experiments)
     return None if result is None else Formula(result, component, tuple(terms))
 
 
-def formula(
-    of: Hypothesis, free: Formula, place: Place, experiments: Sequence[Experiment], scale: Scale,
-    price: float,
-) -> Formula | None:  # fmt: skip
+def formula(of: Hypothesis, free: Formula, place: Place, scale: Scale) -> Formula | None:
     """Return the formula that explains most beside a hypothesis, less its price; None of none.
 
     It is looked for first along the course of the model with a free function there, which is near
     the truth's.
     """
     formulas: list[Formula] = []
-    tried, now = set[frozenset[Term]](), free
+    tried, now, price = set[frozenset[Term]](), free, scale.limits.price
 
     def score(f: Formula) -> float:
         return scale.evidence(f.hypothesis) - price * f.parameters
 
     for _ in range(_ROUNDS):
         with suppress(PsaError):
-            for chosen in _chosen(now, place, experiments, price):
+            for chosen in _chosen(now, place, price):
                 terms = tuple(t for t, _, _ in chosen)
                 if frozenset(terms) not in tried:
                     tried.add(frozenset(terms))
-                    formulas += _both(of, now.hypothesis.fit, place, chosen, experiments)
+                    formulas += _both(of, now.hypothesis.fit, place, chosen)
         if not formulas or (best := max(formulas, key=score)) is now:
             break
         now = best
     return max(formulas, key=score, default=None)
 
 
-def _both(
-    of: Hypothesis, begin: Fit, place: Place, chosen: Sequence[_Choice],
-    experiments: Sequence[Experiment],
-) -> list[Formula]:  # fmt: skip
+def _both(of: Hypothesis, begin: Fit, place: Place, chosen: Sequence[_Choice]) -> list[Formula]:
     """Return a set of terms, fitted from what it promises; from nothing where that fails."""
     terms = tuple(t for t, _, _ in chosen)
     if any(t.whole and c <= 0.0 for t, _, c in chosen):
@@ -292,44 +277,39 @@ def _both(
     promised = {n: float(np.clip(v, *bounds[n])) for n, v in promised.items()}
     for start in (promised, nothing):
         with suppress(PsaError):
-            result = fitted(of, begin, component, terms, experiments, start)
+            result = fitted(of, begin, component, terms, start)
             return [] if result is None else [result]
     return []
 
 
-def _chosen(
-    now: Formula, place: Place, experiments: Sequence[Experiment], price: float
-) -> list[list[_Choice]]:
+def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     """Return of every size the set of terms that explains most along the course of a model."""
-    fit, item = now.hypothesis.fit, {*now.component.fitted}
+    fit, added = now.hypothesis.fit, {*now.component.fitted}
     known = {(t, h): c for t, h, c in now.choices(fit.model.values)}
     library = [t for t in place.library() if not t.over]
     ratios = [t for t in place.library() if t.over]
     steep = [(t, h / place.sizes[t.over]) for t in ratios for h in _STEEP]
     trials = [*dict.fromkeys([*((t, 0.0) for t in library), *steep, *known])]
     effects = [place.component(f"trial{k}", [t], [h]) for k, (t, h) in enumerate(trials)]
-    columns = tangents(fit, experiments, effects)
+    columns = tangents(fit, now.hypothesis.experiments, effects)
     at = [k for k, e in enumerate(effects) if e.name in columns]
     sizes = np.array([effects[k].parameters[0].typical(fit.model.values) for k in at])
     first, further = zip(*(columns[effects[k].name] for k in at), strict=True)
     colour = now.hypothesis.colour
-    items = [np.column_stack(part) for part in zip(*further, strict=True)]
-    white = colour.whiten_all(np.column_stack(first), items)
+    others = [np.column_stack(part) for part in zip(*further, strict=True)]
+    white = colour.whiten_all(np.column_stack(first), others)
     factors = np.array([known.get(trials[k], 0.0) for k in at])
-    target = whitened_residuals(fit, colour) + white @ (factors / sizes)
-    kept = [n not in item for n in fit.unknowns.names]
+    target = screening.whitened_residuals(fit, colour) + white @ (factors / sizes)
+    kept = [n not in added for n in fit.unknowns.names]
     kept += [True] * (fit.unknowns.size - len(kept))
-    basis = independent(whitened_jacobian(fit, colour)[:, kept])
-    left, target = without(white, basis), without(target, basis)
-    output = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
-    left, at, sizes = (
-        left[:, output],
-        [k for k, q in zip(at, output, strict=True) if q],
-        sizes[output],
-    )
+    basis = screening.independent(screening.whitened_jacobian(fit, colour)[:, kept])
+    left, target = screening.without(white, basis), screening.without(target, basis)
+    new = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
+    told = [trials[k] for k, q in zip(at, new, strict=True) if q]
+    left, sizes = left[:, new], sizes[new]
     return [
-        [(*trials[at[k]], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
-        for rows, gains in _best_subsets(left, target, [trials[k][0] for k in at], price)
+        [(*told[k], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
+        for rows, gains in _best_subsets(left, target, [t for t, _ in told], price)
     ]
 
 
@@ -344,7 +324,7 @@ def _best_subsets(
     unit, n, total = columns / norms, len(target), float(target @ target)
     gram, along = unit.T @ unit + 1e-9 * np.eye(len(norms)), unit.T @ target
     costs = (price + np.log(len(norms))) * np.array([t.parameters for t in terms])
-    items = []
+    subsets = []
     for count in range(1, min(_TERMS, len(norms)) + 1):
         sets = np.array([*combinations(range(len(norms)), count)])
         g, b = gram[sets[:, :, None], sets[:, None, :]], along[sets]
@@ -354,5 +334,5 @@ def _best_subsets(
         scores[[len({terms[j] for j in one}) < count for one in sets]] = -np.inf
         k = int(np.argmax(scores))
         if scores[k] > 0.0:
-            items.append((sets[k].tolist(), gains[k] / norms[sets[k]]))
-    return items
+            subsets.append((sets[k].tolist(), gains[k] / norms[sets[k]]))
+    return subsets

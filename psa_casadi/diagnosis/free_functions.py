@@ -14,17 +14,12 @@ import casadi as ca
 import numpy as np
 
 from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.corrections import FreeFunction, estimates
 from psa_casadi.diagnosis.formulas import Formula, Place, fitted, formula, place_of
 from psa_casadi.diagnosis.generic.attached import Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
-from psa_casadi.diagnosis.screening import (
-    independent,
-    whitened_jacobian,
-    whitened_residuals,
-    without,
-)
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
@@ -71,24 +66,23 @@ def fit_free_functions(
 
     `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
-    of, experiments = view.of, task.experiments
-    sizes = _sizes(base, of, experiments)
+    of, sizes = view.of, _sizes(base, view.of)
     scored: list[tuple[float, Place, Component]] = []
     for port in ports_of(base):
         if port.kind != "intermediate" or is_place(base, port):
             place = place_of(base, port, sizes)
             component = place.component(f"free_in_{port.kind}_{port.variable}", place.polynomial())
             with suppress(PsaError):
-                scored.append((_decrease(view, component, experiments), place, component))
+                scored.append((_decrease(view, component), place, component))
     scored.sort(key=lambda s: -s[0])
-    items = []
+    free_functions = []
     for _, place, component in scored[:_FITTED]:
         task.progress(f"a free function in {place.port.words}")
         with suppress(PsaError):
-            free = fitted(of, of.fit, component, place.polynomial(), experiments)
+            free = fitted(of, of.fit, component, place.polynomial())
             if free is not None:
-                items.append(_told(free, of, place, task, base, effects, scale))
-    return sorted(items, key=lambda f: -f.evidence)
+                free_functions.append(_added(free, of, place, base, effects, scale))
+    return sorted(free_functions, key=lambda f: -f.evidence)
 
 
 def formula_of(
@@ -105,38 +99,36 @@ def formula_of(
     Its numbers are those of the `whole` records where the model with it follows these.
     """
     port = next(p for p in ports_of(base) if p.words == free_function.port)
-    place = place_of(base, port, _sizes(base, of, task.experiments))
+    place = place_of(base, port, _sizes(base, of))
     task.progress(f"a formula in {port.words}")
-    result = formula(of, free_function.fitted, place, task.experiments, scale, task.limits.price)
+    result = formula(of, free_function.fitted, place, scale)
     if result is None:
         return None
     rows = zip(result.hypothesis.errors, free_function.held, strict=True)
     if any(error > _AS_WELL * before for error, before in rows):
         return None
-    item = _told(result, of, place, task, base, effects, scale)
-    if len(whole) < len(task.experiments):
+    told = _added(result, of, place, base, effects, scale)
+    model = told.model
+    if len(whole) < len(of.experiments):
         with suppress(PsaError):
-            fit = fit_longer_parts(result.hypothesis.fit, task.experiments, whole)
+            fit = fit_longer_parts(result.hypothesis.fit, of.experiments, whole)
             if follows(fit, whole):
-                added = [*effects, Attached(result.component, port)]
-                item = replace(item, model=model_of(base, fit, added, whole))
-    return replace(
-        item,
-        equation=result.equation(port.balance, item.model.values),
-        parameters=estimates(result.component, item.model),
-    )
+                model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
+    equation = result.equation(port.balance, model.values)
+    parameters = estimates(result.component, model)
+    return replace(told, model=model, equation=equation, parameters=parameters)
 
 
-def _told(
-    result: Formula, of: Hypothesis, place: Place, task: Task, base: Model,
-    effects: Sequence[Attached], scale: Scale,
+def _added(
+    result: Formula, of: Hypothesis, place: Place, base: Model, effects: Sequence[Attached],
+    scale: Scale,
 ) -> FreeFunction:  # fmt: skip
     """Return a fitted function, and what it adds beside the variable that it follows most."""
-    h, port, experiments = result.hypothesis, place.port, task.experiments
+    h, port, experiments = result.hypothesis, place.port, of.experiments
     s = h.fit.model.structure
     term = result.component.equations(Symbols(s.symbols)).add[port.balance]
-    items = [s.symbols[place.symbols[n]] for n in place.names]
-    *rows, added = _along(h.fit, experiments, [*items, term])
+    variables = [s.symbols[place.symbols[n]] for n in place.names]
+    *rows, added = _along(h.fit, experiments, [*variables, term])
     values = dict(zip(place.names, rows, strict=True))
 
     def scatter(name: str) -> float:
@@ -147,14 +139,13 @@ def _told(
         return float(rest @ rest)
 
     name = min(values, key=scatter)
+    seen = {n for t in result.terms for n in (*t.factors, t.over)}
     return FreeFunction(
         port=port.words,
         evidence=scale.evidence(h) - scale.evidence(of),
         held=h.errors,
-        predicted=h.shown,
-        of=" and ".join(
-            n for n in place.names if any(n in (*t.factors, t.over) for t in result.terms)
-        ),
+        predicted=h.predictions,
+        of=" and ".join(n for n in place.names if n in seen),
         unit=port.unit,
         variable=name,
         variable_unit=place.units[name],
@@ -180,17 +171,19 @@ def _along(
     return np.hstack(result)
 
 
-def _sizes(base: Model, of: Hypothesis, experiments: Sequence[Experiment]) -> Sizes:
+def _sizes(base: Model, of: Hypothesis) -> Sizes:
     starts = [{n: v for n, v in s.items() if n in base.state_names} for s in of.fit.starts()]
-    return sizes_of(base, experiments, starts)
+    return sizes_of(base, of.experiments, starts)
 
 
-def _decrease(view: View, component: Component, experiments: Sequence[Experiment]) -> float:
+def _decrease(view: View, component: Component) -> float:
     """Return the decrease of the whitened sum of squares that the coefficients promise together."""
     fit, colour = view.of.fit, view.screening.colour
     model = fit.model.with_effect(component)
     moved = {p.name: p.typical(fit.model.values) for p in component.parameters}
-    columns, further = changes(fit, experiments, model, moved, tuple(fit.starts()), 0.0)
-    basis = independent(whitened_jacobian(fit, colour))
-    free = independent(without(colour.whiten_all(columns, further), basis))
-    return float(np.sum((free.T @ without(whitened_residuals(fit, colour), basis)) ** 2))
+    starts = tuple(fit.starts())
+    columns, further = changes(fit, view.of.experiments, model, moved, starts, 0.0)
+    basis = screening.independent(screening.whitened_jacobian(fit, colour))
+    free = screening.independent(screening.without(colour.whiten_all(columns, further), basis))
+    residual = screening.without(screening.whitened_residuals(fit, colour), basis)
+    return float(np.sum((free.T @ residual) ** 2))

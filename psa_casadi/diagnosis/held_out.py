@@ -37,20 +37,14 @@ def parts_of(*errors: Sequence[FloatArray]) -> tuple[FloatArray, IndexArray]:
     output is not judged. The parts are the records that have any, where there are at least four,
     else eight blocks of each.
     """
-    rows = [item for item in zip(*errors, strict=True) if len(item[0])]
+    rows = [row for row in zip(*errors, strict=True) if len(row[0])]
     if len(rows) < FEWEST_RECORDS:
-        rows = [
-            block
-            for item in rows
-            for block in zip(*(np.array_split(e, _BLOCKS) for e in item), strict=True)
-            if len(block[0])
-        ]
+        blocks = [zip(*(np.array_split(e, _BLOCKS) for e in r), strict=True) for r in rows]
+        rows = [block for of_one in blocks for block in of_one if len(block[0])]
     outputs = errors[0][0].shape[1]
     judged = [~np.isnan(np.array(row)).all(axis=0) for row in rows]
-    sums = [
-        [np.sum(e**2, axis=0, where=there) for e in row]
-        for row, there in zip(rows, judged, strict=True)
-    ]
+    pairs = zip(rows, judged, strict=True)
+    sums = [[np.sum(e**2, axis=0, where=there) for e in row] for row, there in pairs]
     counts = np.array([there.sum(axis=0) for there in judged], dtype=np.int64)
     return np.reshape(sums, (-1, len(errors), outputs)), counts.reshape(-1, outputs)
 
@@ -218,7 +212,7 @@ class Share:
     interval: tuple[float, float]
 
     @property
-    def shown(self) -> tuple[float, float, float]:
+    def clipped(self) -> tuple[float, float, float]:
         """The share and the ends of its interval as they are shown, cut to 0 to 1."""
         share, low, high = (min(max(v, 0.0), 1.0) for v in (self.share, *self.interval))
         return share, low, high
@@ -229,7 +223,7 @@ class Share:
 
         A share that is not 0 is never told as 0, one below 1 told as 100 only from 99.995 on.
         """
-        share, low, high = self.shown
+        share, low, high = self.clipped
         off = min(1.0 - self.interval[0], self.interval[1])
         off = 1.0 if off < 0.0 else off  # beyond what is shown
         digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
@@ -382,9 +376,7 @@ def stack_budget(
     excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
     whole = errors_of(experiments, extended)
     return StackBudget(
-        result.together,
-        result.causes,
-        result.unnamed,
+        **vars(result),
         excess_rms_m=excess,
         noise_rms_m=noise,
         remains_rms_m=remains,

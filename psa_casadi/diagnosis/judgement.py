@@ -11,13 +11,14 @@ from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
-from psa_casadi.diagnosis.families import SUREST, Family, Shown, families, place_and_kind
+from psa_casadi.diagnosis.families import SUREST, CauseEvidence, Family, families, place_and_kind
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
 from psa_casadi.diagnosis.generic.attached import Attached
 from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
+    NOISE,
     Candidate,
     Cause,
     Diagnosis,
@@ -27,7 +28,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.result import EXCESSIVE
@@ -56,12 +57,6 @@ class Weighed:
     share: float
     each: Mapping[str, float]
     corrections: Sequence[Correction]
-    limits: Thresholds
-
-    @property
-    def adds(self) -> bool:
-        """Do the causes remove more than their form may be wrong by, named or not?"""
-        return self.share > self.limits.form
 
     @property
     def least(self) -> tuple[str, float]:
@@ -69,7 +64,7 @@ class Weighed:
         return min({"": self.share, **self.each}.items(), key=lambda item: item[1])
 
 
-def told_from(step: Step, limits: Thresholds) -> tuple[str, ...]:
+def indistinguishable(step: Step, limits: Thresholds) -> tuple[str, ...]:
     """Effects that may as well be a step's cause: with the chosen one, the credible set."""
     if step.chosen is None:
         return ()
@@ -86,7 +81,7 @@ class Judge:
 
     def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
         self.steps, self.task, self.driven = tuple(steps), task, driven
-        self.first, self.last = self.steps[0], self.steps[-1]
+        self.first, self.last, self.searched = self.steps[0], self.steps[-1], self.steps[:-1]
         self.experiments, self.limits = task.experiments, task.limits
         self._left: dict[Step, Remaining] = {}
 
@@ -111,7 +106,7 @@ class Judge:
         """Return the unnamed corrections beside a hypothesis."""
         raise NotImplementedError
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return what only held-out samples tell that a model misses, and its p value."""
         raise NotImplementedError
 
@@ -123,23 +118,25 @@ class Judge:
         """Return the place and the kind of an effect."""
         return effect.belongs_to, effect.kind
 
-    # What is said of any
+    # What every kind of device has
+
+    @cached_property
+    def scale(self) -> Scale:
+        """The evidence of hypotheses over the base, by the noise that the best one leaves."""
+        return Scale(self.first.view.of, self.last.screening.colour, self.limits)
 
     def left(self, step: Step) -> Remaining:
         """Return what the model of a step leaves, in fitted samples or in held-out ones."""
         if step not in self._left:
-            test, beyond = step.test, self.unseen(step)
-            p = test.p_value if beyond is None else min(test.p_value, beyond[1])
-            if test.alarm:
-                remaining = Remaining(False, p, test.finding)
-            else:
-                remaining = Remaining(True, p) if beyond is None else Remaining(False, p, beyond[0])
-            self._left[step] = remaining
+            test, beyond = step.test, self.held_out_finding(step)
+            finding, p = (NOISE, 1.0) if beyond is None else beyond
+            finding = test.finding if test.alarm else finding
+            self._left[step] = Remaining(finding is NOISE, min(test.p_value, p), finding)
         return self._left[step]
 
-    def _shown(self, evidence: float) -> Shown:
+    def _shown(self, evidence: float) -> CauseEvidence:
         """Return what a cause has beside the others that has so much evidence."""
-        return Shown(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
+        return CauseEvidence(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
 
     @property
     def missing(self) -> bool:
@@ -155,8 +152,7 @@ class Judge:
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
         result = self.corrections(before) if beside else ()
-        removed = removed_from(self.experiments, before.shown, self.noise)
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
+        removed = removed_from(self.experiments, before.predictions, self.noise)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
@@ -164,11 +160,10 @@ class Judge:
             if len(rows) > 1 and base > EXCESSIVE * floor
         }
         return Weighed(
-            evidence=scale.evidence(after) - scale.evidence(before),
-            share=removed.from_base(after.shown),
+            evidence=self.scale.evidence(after) - self.scale.evidence(before),
+            share=removed.from_base(after.predictions),
             each=each,
             corrections=result,
-            limits=self.limits,
         )
 
     @cached_property
@@ -177,36 +172,36 @@ class Judge:
         both = self.first.view.of, self.last.view.of
         return self.weigh(*both, beside=self.missing and self.driven)
 
+    @property
+    def adds(self) -> bool:
+        """Whether the causes remove more than their form may be wrong by, named or not."""
+        return self.weighed.share > self.limits.form
+
     @cached_property
     def each(self) -> dict[str, Weighed]:
         """Every cause by itself, against corrections of the model without it, all others kept."""
-        last, weigheds = self.last.view.of, {}
-        for s in self.steps if self.doubt is None else ():
-            if s.chosen is not None and s.without is not None:
-                if s.without.fit is self.first.fit:
-                    weigheds[s.cause.name] = self.weighed
-                    continue
-                weighed = self.weigh(s.without, last)
-                weigheds[s.cause.name] = replace(
-                    weighed, corrections=self._instead(weighed.corrections)
-                )
-        return weigheds
+        pairs = [(s.cause.name, s.without) for s in self.searched if s.without is not None]
+        return {n: self._alone(less) for n, less in pairs if self.doubt is None}
 
-    def _instead(self, corrections: Sequence[Correction]) -> list[Correction]:
-        """Return corrections with what they add in a cause's place alone.
+    def _alone(self, less: Hypothesis) -> Weighed:
+        """Weigh one cause against what corrections add in its place alone.
 
         What they add beside all causes as well is no word against one of these.
         """
-        more = {c.name: max(c.evidence, 0.0) for c in self._beside_last}
-        return [replace(c, evidence=c.evidence - more.get(c.name, 0.0)) for c in corrections]
+        if less.fit is self.first.fit:
+            return self.weighed
+        weighed = self.weigh(less, self.last.view.of)
+        more = {c.name: max(c.evidence, 0.0) for c in self._last_corrections}
+        pairs = [(c, c.evidence - more.get(c.name, 0.0)) for c in weighed.corrections]
+        return replace(weighed, corrections=[replace(c, evidence=e) for c, e in pairs])
 
     @cached_property
-    def _beside_last(self) -> Sequence[Correction]:
+    def _last_corrections(self) -> Sequence[Correction]:
         """The unnamed corrections beside all causes, where structure remains."""
         return self.corrections(self.last.view.of) if self.last.test.alarm else ()
 
     @cached_property
-    def vague(self) -> dict[str, Correction]:
+    def unlisted(self) -> dict[str, Correction]:
         """Causes that are rather none of the listed effects, with the best unnamed correction."""
         better: dict[str, Correction] = {}
         alone = max(self.weighed.corrections, key=lambda c: c.evidence, default=None)
@@ -224,7 +219,7 @@ class Judge:
     def unnamed(self) -> set[str]:
         """Causes that are vague, or without which the model is as likely."""
         price = self.limits.price
-        return {*self.vague, *(n for n, item in self.each.items() if item.evidence <= price)}
+        return {*self.unlisted, *(n for n, item in self.each.items() if item.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -237,8 +232,8 @@ class Judge:
                 self.each[s.cause.name].corrections,
                 self.limits,
             )
-            for s in self.steps
-            if s.chosen is not None and s.cause.name in self.each
+            for s in self.searched
+            if s.cause.name in self.each
         }
 
     @property
@@ -256,26 +251,24 @@ class Judge:
     def verdict(self) -> Verdict:
         """The verdict; the first of these that is so decides."""
         unnamed = self.unnamed
-        items = [s for s in self.steps if s.chosen is not None and s.cause.name not in unnamed]
+        named = [s for s in self.searched if s.cause.name not in unnamed]
         little = self.weighed.least[1] < self.least
         if not self.driven:
             return "not_driven"
         if not self.missing:
             return "adequate"
-        if self.doubt is not None or not items or little:
+        if self.doubt is not None or not named or little:
             return "unexplained"
-        if told_from(items[0], self.limits):
+        if indistinguishable(named[0], self.limits):
             return "ambiguous"
-        more = self.vague or not self.left(self.last).white
+        more = self.unlisted or not self.left(self.last).white
         return "partly_explained" if more else "cause_named"
 
     @cached_property
     def kept(self) -> tuple[Step, ...]:
         """The steps to the causes that the extended model holds, named or not."""
-        weak = self.verdict == "unexplained" and self.doubt is None and not self.vague
-        if self.verdict in NAMING or (weak and self.weighed.adds):
-            return tuple(s for s in self.steps if s.chosen is not None)
-        return ()
+        weak = self.verdict == "unexplained" and self.doubt is None and not self.unlisted
+        return self.searched if self.verdict in NAMING or (weak and self.adds) else ()
 
     @property
     def final(self) -> Step:
@@ -283,20 +276,20 @@ class Judge:
         return self.last if self.kept else self.first
 
     @cached_property
-    def beside_final(self) -> Sequence[Correction]:
+    def final_corrections(self) -> Sequence[Correction]:
         """The unnamed corrections beside the extended model."""
         if self.final is self.last and self.last.test.alarm:
-            return self._beside_last
+            return self._last_corrections
         return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
 
     @cached_property
     def best_correction(self) -> Correction | None:
         """The unnamed correction that would remove most of what the extended model leaves."""
         of, colour = self.final.view.of, self.last.screening.colour
-        return best_of(self.beside_final, self.experiments, of.errors, colour, self.limits)
+        return best_of(self.final_corrections, self.experiments, of.errors, colour, self.limits)
 
     @property
-    def told_correction(self) -> Correction | None:
+    def reported_correction(self) -> Correction | None:
         """The same in the form that is told."""
         return self.best_correction
 
@@ -306,16 +299,16 @@ class Judge:
         if self.best_correction is None or self.left(self.final).white:
             return ()
         most = self.best_correction.evidence
-        return families({}, {}, self._shown(most), self.beside_final, self.limits)
+        return families({}, {}, self._shown(most), self.final_corrections, self.limits)
 
     @cached_property
     def budget(self) -> Budget:
         """Where the base's held-out error goes."""
-        unnamed = self.told_correction
+        unnamed = self.reported_correction
         return budget(
-            removed_from(self.experiments, self.first.view.of.shown, self.noise),
-            self.final.view.of.shown,
-            [(s.cause.name, s.without.shown) for s in self.kept if s.without is not None],
+            removed_from(self.experiments, self.first.view.of.predictions, self.noise),
+            self.final.view.of.predictions,
+            [(s.cause.name, s.without.predictions) for s in self.kept if s.without is not None],
             None if unnamed is None else (unnamed.name, unnamed.predicted),
         )
 
@@ -328,7 +321,7 @@ class Judge:
         """
         if not self.last.test.alarm or len(self.steps) < 2 or self.verdict not in NAMING:
             return ()
-        shares = [c for c in self.budget.causes if c.what not in self.vague]
+        shares = [c for c in self.budget.causes if c.what not in self.unlisted]
         most = max((c.share for c in shares), default=0.0)
         least = min(self.limits.form, self.limits.enough * most if most > 0.0 else most)
         return tuple(c for c in shares if c.share < least)
@@ -350,8 +343,8 @@ class Judge:
             belongs_to=step.cause.belongs_to,
             confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
-            cannot_be_told_from=told_from(step, self.limits),
-            explained_share=0.0 if item is None else item.shown[0],
+            cannot_be_told_from=indistinguishable(step, self.limits),
+            explained_share=0.0 if item is None else item.clipped[0],
             remedy=step.cause.what_now.code,
             sizes=tuple(sizes),
             port=port,
@@ -361,32 +354,32 @@ class Judge:
 
     def withdrawn(self) -> tuple[Note, ...]:
         """Return which names were found but not told, and why."""
-        names = tuple(s.cause.name for s in self.steps if s.chosen is not None)
+        names = tuple(s.cause.name for s in self.searched)
         if not names:
             return ()
         (output, share), kept = self.weighed.least, False
         if self.doubt is not None:
             why = self.doubt
-        elif self.vague:
+        elif self.unlisted:
             why = self._better()
         else:
             more = self.last.test.alarm
-            why, kept = note("little", least=self.least, more=more), self.weighed.adds
+            why, kept = note("little", least=self.least, more=more), self.adds
         return (
             note("withdrawn", names=names, evidence=self.weighed.evidence, share=max(0.0, share),
                  output=output, kept=kept, why=why),
         )  # fmt: skip
 
     def _better(self) -> Note:
-        return note("better_unnamed", each=tuple((c.said, n) for n, c in self.vague.items()))
+        return note("better_unnamed", each=tuple((c.label, n) for n, c in self.unlisted.items()))
 
     @property
-    def said(self) -> tuple[Note | str, ...]:
+    def remarks(self) -> tuple[Note | str, ...]:
         """Which names were withdrawn, which causes are too vague or too small to be named."""
         notes = self.withdrawn() if self.verdict == "unexplained" else ()
-        if self.vague and self.verdict != "unexplained":
+        if self.unlisted and self.verdict != "unexplained":
             # they stay in the model without a name
-            notes = (note("vague", names=tuple(self.vague), why=self._better()),)
+            notes = (note("vague", names=tuple(self.unlisted), why=self._better()),)
         small = (note("small", effect=c.what, share=max(c.share, 0.0)) for c in self.small)
         return (*notes, *small)
 
@@ -422,7 +415,7 @@ class Judge:
     @property
     def common(self) -> dict[str, Any]:
         """What the diagnosis of every kind of device holds."""
-        best = self.told_correction
+        best = self.reported_correction
         share = 0.0 if self.budget.unnamed is None else self.budget.unnamed.share
         return {
             "verdict": self.verdict,
@@ -447,12 +440,17 @@ class ModelJudge(Judge):
     """
 
     def __init__(
-        self, known: Known, base: Model, table: Mapping[str, Attached], whole: Sequence[Experiment]
+        self,
+        known: SearchState,
+        base: Model,
+        table: Mapping[str, Attached],
+        whole: Sequence[Experiment],
     ) -> None:
-        super().__init__(steps_of(known, known.task), known.task)
+        super().__init__(steps_of(known), known.task)
         self.known, self.base, self.table, self.whole = known, base, table, whole
         self.views = {s.view.of.names: s.view for s in self.steps}
-        self.views |= {s.beside.of.names: s.beside for s in self.steps if s.beside is not None}
+        views = [s.view_without for s in self.steps if s.view_without is not None]
+        self.views |= {v.of.names: v for v in views}
 
     @cached_property
     def noise(self) -> tuple[float, ...]:
@@ -467,35 +465,35 @@ class ModelJudge(Judge):
     @cached_property
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
-        attached = [self.table[s.cause.name] for s in self.kept]
-        return model_of(self.base, self.final.fit, attached, self.experiments)
+        effects = [self.table[s.cause.name] for s in self.kept]
+        return model_of(self.base, self.final.fit, effects, self.experiments)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions beside a hypothesis; none beside causes that leave no structure."""
         view = self.views[of.names]
         if of.causes and not view.test.alarm:
             return ()
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        effects = [self.table[c.name] for c in of.causes]
-        return fit_free_functions(view, self.task, self.base, effects, scale)
+        return fit_free_functions(view, self.task, self.base, self._attached(of), self.scale)
+
+    def _attached(self, of: Hypothesis) -> list[Attached]:
+        return [self.table[c.name] for c in of.causes]
 
     @cached_property
-    def told_correction(self) -> Correction | None:
+    def reported_correction(self) -> Correction | None:
         """The unnamed correction as a formula, where few terms predict as well."""
         best, of = self.best_correction, self.final.view.of
         if not isinstance(best, FreeFunction):
             return best
-        scale = Scale(self.first.view.of, self.last.screening.colour, self.limits)
-        effects = [self.table[c.name] for c in of.causes]
-        law = formula_of(best, of, self.task, self.base, effects, scale, self.whole)
+        effects = self._attached(of)
+        law = formula_of(best, of, self.task, self.base, effects, self.scale, self.whole)
         return best if law is None else replace(law, open_to=best.open_to)
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return which output's held-out samples are unlike the fitted ones.
 
         Without causes these leave noise of any colour, and the innovations are compared.
         """
-        rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.own, strict=True)
+        rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.colours, strict=True)
         for o, noise, item in rows:
             if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
                 excess = held_out_within(item, len(step.fit.theta), self.limits)
@@ -504,7 +502,7 @@ class ModelJudge(Judge):
                     return output, excess.p_value
                 continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
-            rms = missed_rms(self.experiments, step.view.of.shown, o.number)
+            rms = missed_rms(self.experiments, step.view.of.predictions, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
             if held and rms > least:
                 output = note("held_out_unlike", output=o.column, ratio=rms / noise)
@@ -532,10 +530,10 @@ class ModelJudge(Judge):
         return self.cause(step, sizes, self.table[step.cause.name].port.words)
 
     @property
-    def said(self) -> tuple[Note | str, ...]:
+    def remarks(self) -> tuple[Note | str, ...]:
         """What is said of any, which causes cancel each other, which add too little to be told."""
         left_out = () if self.doubt else self._left_out()
-        return (*super().said, *self._cancelling(), *left_out)
+        return (*super().remarks, *self._cancelling(), *left_out)
 
     def _cancelling(self) -> tuple[Note, ...]:
         """Return the output that one of several causes changes much more than all of them do."""
@@ -551,10 +549,7 @@ class ModelJudge(Judge):
         if times < _CANCEL or size is None or both is None:
             return ()
         alone, together = (size.value, size.unit), (both.value, both.unit)
-        statement = note(
-            "cancel", effect=effect, output=size.output, alone=alone, together=together
-        )
-        return (statement,)
+        return (note("cancel", effect=effect, output=size.output, alone=alone, together=together),)
 
     def _left_out(self) -> tuple[Note, ...]:
         """Return which causes are clearly likelier than the best, but may only correct its form.
@@ -566,12 +561,12 @@ class ModelJudge(Judge):
             return ()
         clearly = self.limits.clearly * temperature(known.scale.evidence(best))
         least = known.scale.score(best) + clearly
-        better = [h for h in known.found.values() if known.scale.score(h) > least]
-        better = [h for h in better if known.slight(h) and known.worth(h, form=False)]
+        better = [h for h in known.hypotheses.values() if known.scale.score(h) > least]
+        better = [h for h in better if known.small_causes(h) and known.is_admissible(h, form=False)]
         top = max(better, key=known.scale.score, default=None)
         if top is None:
             return ()
-        names, small = (tuple(sorted(n)) for n in (top.names, known.slight(top)))
+        names, small = (tuple(sorted(n)) for n in (top.names, known.small_causes(top)))
         more = known.scale.evidence(top) - known.scale.evidence(best)
         return (note("slight", names=names, more=more, small=small, least=self.limits.further),)
 
@@ -580,18 +575,14 @@ class ModelJudge(Judge):
         """Return the diagnosis."""
         first, final = self.first, self.final
         experiments, noise = self._noise(final)
-        errors = tuple(
-            OutputError(
-                o.column,
-                o.channel.unit,
-                level,
-                *(missed_rms(self.experiments, s.view.of.shown, o.number) for s in (first, final)),
-            )
-            for o, level in zip(final.fit.channels, noise, strict=True)
-        )
+        both = [s.view.of.predictions for s in (first, final)]
+        errors = []
+        for o, level in zip(final.fit.channels, noise, strict=True):
+            rms = [missed_rms(self.experiments, p, o.number) for p in both]
+            errors.append(OutputError(o.column, o.channel.unit, level, *rms))
         extended = self.extended
         base = tuple(first.fit.outputs(self.experiments)) if self.kept else extended
         return Diagnosis(
-            errors=errors, remarks=self.said, experiments=experiments, base=base,
+            errors=tuple(errors), remarks=self.remarks, experiments=experiments, base=base,
             extended=extended, **self.common,
         )  # fmt: skip

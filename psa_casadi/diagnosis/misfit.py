@@ -5,18 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from psa_casadi.diagnosis import views
 from psa_casadi.diagnosis.noise import NoiseFloor
-from psa_casadi.diagnosis.views import (
-    Drive,
-    Ground,
-    View,
-    axes,
-    drive_of,
-    ground_of,
-    hold_axis,
-    time_axis,
-    view,
-)
+from psa_casadi.diagnosis.views import View
 from psa_casadi.errors import InputError
 from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency
@@ -329,16 +320,16 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
             f" valid samples of {residual.size} for {record.n} instants; give one value for each"
             f" instant, {FEWEST} of them valid at least."
         )
-    ground = ground_of(residual, floor.level)
-    drive = drive_of(record)
-    over_time = view(ground, time_axis(record))
+    ground = views.ground_of(residual, floor.level)
+    drive = views.drive_of(record)
+    over_time = views.view(ground, views.time_axis(record))
     steady = _steady(ground, record, over_time, drive)
     known = record.displacement  # the prediction is this less the residual, up to a constant
     predicted = np.full(record.n, np.nan) if known is None else known - residual
-    rows = axes(record, predicted, drive)
+    rows = views.axes(record, predicted, drive)
     # what varies as slowly as time itself would vanish with the drift
     slow = ("amplitude", "frequency")
-    views = [over_time, *(view(ground if a.name in slow else steady, a) for a in rows)]
+    all_views = [over_time, *(views.view(ground if a.name in slow else steady, a) for a in rows)]
     held, slope, count = _holds(record, ground)
     split = harmonic_split(record, residual)
     line = split.fundamental if split is not None else drive_frequency(record)
@@ -346,23 +337,25 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     power = float(np.mean(ground.residual**2))
     excess = max(0.0, 1.0 - floor.level**2 / power) if power > 0 else 0.0
     rms, mean, unit = float(np.sqrt(power)), float(np.nanmean(residual)), record.displacement_unit
-    items = [(v.share, _followed(v, unit)) for v in views if v.significant]
+    shares = [(v.share, _followed(v, unit)) for v in all_views if v.significant]
     if held is not None and held.significant:
-        items.append((held.share, _held(held, slope, count, unit)))
+        shares.append((held.share, _held(held, slope, count, unit)))
     lines = tuple((n.frequency, n.name, (n.amplitude, unit)) for n in spectrum.others[:3])
     output = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
-    items.append((spectrum.share, output))
-    gain = sorted((row for row in items if row[0] > WORTH_SAYING), key=lambda row: -row[0])
+    shares.append((spectrum.share, output))
+    gain = sorted((row for row in shares if row[0] > WORTH_SAYING), key=lambda row: -row[0])
     findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in gain)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:
         findings.append(_split(split, unit))
     return Misfit(
-        record.name, rms, mean, floor, excess, tuple(views), held, slope, spectrum, split,
+        record.name, rms, mean, floor, excess, tuple(all_views), held, slope, spectrum, split,
         tuple(findings),
     )  # fmt: skip
 
 
-def _steady(ground: Ground, record: Record, over_time: View, drive: Drive) -> Ground:
+def _steady(
+    ground: views.Ground, record: Record, over_time: View, drive: views.Drive
+) -> views.Ground:
     """Return the residual without its slow part, if the drive turns often in every bin of time.
 
     A drift would hide smaller views. Under a slow drive the two cannot be told apart, and the
@@ -374,12 +367,12 @@ def _steady(ground: Ground, record: Record, over_time: View, drive: Drive) -> Gr
     return replace(ground, residual=ground.residual - np.interp(time, over_time.x, over_time.mean))
 
 
-def _holds(record: Record, ground: Ground) -> tuple[View | None, Slope | None, int]:
+def _holds(record: Record, ground: views.Ground) -> tuple[View | None, Slope | None, int]:
     """Return the residual against lg of the time since a hold began, its slope, and the holds."""
-    axis, count = hold_axis(record)
+    axis, count = views.hold_axis(record)
     if not count:
         return None, None, 0
-    result = view(ground, axis)
+    result = views.view(ground, axis)
     good = result.spread > 0
     if np.count_nonzero(good) < 3:
         return result, None, count

@@ -95,7 +95,7 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
     return result.autoregression if result.level <= rms(residual) else None
 
 
-def knowable(
+def detection_limit(
     record: Record, error: float, residual: FloatArray, limits: Thresholds = LIMITS
 ) -> float:
     """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
@@ -111,15 +111,12 @@ def knowable(
     return float(np.sqrt(rounding**2 + error**2 + (limits.form_of_range * size) ** 2))
 
 
-def knowable_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
+def detection_limit_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
     """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
     error = max((s.errors[0] for s in fit.simulated if s.errors), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
-    parts = fit.residuals_of(experiments)
-    squares = [
-        knowable(e.record, error, part, limits) ** 2
-        for e, part in zip(experiments, parts, strict=True)
-    ]
+    pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+    squares = [detection_limit(e.record, error, part, limits) ** 2 for e, part in pairs]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
 
@@ -131,9 +128,8 @@ def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
     if measured_noise is None:
         level, r = first_order_noise(valid) if valid.size else (0.0, 0.0)
         covariance = np.asarray(level**2 * r ** np.arange(_LAGS if r > 0 else 1), np.float64)
-        measured_noise = MeasuredNoise(
-            level, covariance, np.array([r] if r > 0 else []), valid.size
-        )
+        regression = np.array([r] if r > 0 else [])
+        measured_noise = MeasuredNoise(level, covariance, regression, valid.size)
     rounding = _rounding(quantum)
     level, covariance = measured_noise.level, measured_noise.autocovariance.copy()
     if level < rounding:
@@ -145,16 +141,8 @@ def _floor(record: Record, valid: FloatArray) -> NoiseFloor:
         quantum=None if quantum is None else (quantum, unit),
         rounding=(rounding, unit),
     )  # fmt: skip
-    return NoiseFloor(
-        record.name,
-        level,
-        source,
-        measured_noise.samples,
-        covariance,
-        measured_noise.autoregression,
-        quantum,
-        finding,
-    )
+    samples, regression = measured_noise.samples, measured_noise.autoregression
+    return NoiseFloor(record.name, level, source, samples, covariance, regression, quantum, finding)
 
 
 def _rounding(quantum: float | None) -> float:

@@ -18,8 +18,8 @@ from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import Known
-from psa_casadi.diagnosis.search.rivals import fit_rivals
+from psa_casadi.diagnosis.search.moves import fit_rivals
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Method, Tried
 from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.experiments import (
@@ -128,7 +128,7 @@ def diagnose_ode(
     noise = noise_found(answer.extended_fit, answer.experiments, (*inputs, *held))
     codes = {n.code for n in notes}
     remarks = (
-        *(n for n in way.said if n.code not in codes),
+        *(n for n in way.notes if n.code not in codes),
         *notes,
         *judge.known.remarks,
         *_entering(judge.final.view.of),
@@ -139,7 +139,7 @@ def diagnose_ode(
 
 def _entering(of: Hypothesis) -> tuple[Note, ...]:
     """Return where noise enters a model, as far as it does not come from its sensors."""
-    rows = [(f.column, item) for f, item in zip(of.fit.channels, of.own, strict=True)]
+    rows = [(f.column, item) for f, item in zip(of.fit.channels, of.colours, strict=True)]
     return tuple(
         note(
             "noise_enters", output=column, place=w.place, rate=w.rate, rms=(w.rms, w.unit),
@@ -167,18 +167,18 @@ def _given(
 
 @dataclass(frozen=True)
 class _Way:
-    """A search from one fit, of whole records or of their parts (`runs`), and what was `said`.
+    """A search from one fit, of whole records or of their parts (`runs`), with `notes`.
 
-    `made` gives the whole records; somebody has `told` what inputs do between samples, or not.
-    `so_far` gets every fit that is better than those before it.
+    `made` gives the whole records; `hold_known` tells whether a user has declared what inputs do
+    between samples. `so_far` gets every fit that is better than those before it.
     """
 
     base: Fit
     runs: tuple[Experiment, ...]
-    said: tuple[Note, ...]
+    notes: tuple[Note, ...]
     table: Mapping[str, Attached]
     made: Made
-    told: bool
+    hold_known: bool
     progress: Callable[[str], None]
     watch: Callable[[Tried], None]
     so_far: list[Fit]
@@ -208,17 +208,17 @@ class _Way:
             raise DiagnosisInterrupted(model) from None
 
     def _judged(
-        self, names: Collection[str], before: Known | None = None
-    ) -> tuple[ModelJudge, tuple[Note, ...], Known]:
+        self, names: Collection[str], before: SearchState | None = None
+    ) -> tuple[ModelJudge, tuple[Note, ...], SearchState]:
         task_of, notes = partial(self._task, names), tuple[Note, ...]()
         if before is None:
-            searched, notes = _search(self.base, self.runs, task_of, told=self.told)
+            searched, notes = _search(self.base, self.runs, task_of, hold_known=self.hold_known)
         else:
             searched = best_first(before.base, task_of(before.task.experiments), before)
             searched.task.keep(searched.answer.fit)
         known = searched
         hold = known.task.experiments[0].record.hold
-        whole = read_like(self.made(None), hold, self.said)
+        whole = read_like(self.made(None), hold, self.notes)
         if len(self.runs) > len(whole):
             known = _of_whole(known, task_of(whole)) or known
         fit_rivals(known)
@@ -254,7 +254,7 @@ def _settled(judge: ModelJudge) -> bool:
 
 def _coloured(judge: ModelJudge) -> bool:
     """Whether a base that lacks nothing leaves noise that is not white."""
-    item = judge.first.view.of.own
+    item = judge.first.view.of.colours
     return judge.verdict == "adequate" and any(c.autoregression.size for c in item)
 
 
@@ -262,22 +262,23 @@ _Tasks = Callable[[tuple[Experiment, ...]], Task]
 
 
 def _search(
-    base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks, *, told: bool
-) -> tuple[Known, tuple[Note, ...]]:
+    base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks, *, hold_known: bool
+) -> tuple[SearchState, tuple[Note, ...]]:
     """Search from a base fit, and again where the records' noise differs by what it finds.
 
-    And with held inputs, if that is likelier and nobody has `told` what they do between samples.
+    And with held inputs, if that is likelier and what they do between samples is not known
+    (`hold_known`).
     """
     known = _once(base, experiments, task_of)
     noise = with_noise(known.answer.fit, experiments)
     if unlike(noise, experiments):
         known.task.progress("searching again, noise by record")
         known = _once(reweighted(base, noise), noise, task_of)
-    other = None if told else _held_instead(known, base, task_of)
+    other = None if hold_known else _held_instead(known, base, task_of)
     return (known, ()) if other is None else other
 
 
-def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Known:
+def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> SearchState:
     ports = {*ports_of(base.model), *parameter_ports(base.model)}
     task = task_of(experiments)
     known = best_first(replace(base, model=with_ports(base.model, ports)), task)
@@ -286,8 +287,8 @@ def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Kn
 
 
 def _held_instead(
-    known: Known, base: Fit, task_of: _Tasks
-) -> tuple[Known, tuple[Note, ...]] | None:
+    known: SearchState, base: Fit, task_of: _Tasks
+) -> tuple[SearchState, tuple[Note, ...]] | None:
     """Return what is found with inputs the other way between samples, if that is likelier.
 
     Looked for where the answer is likelier so, or has straight lines that are late by half a
@@ -315,7 +316,7 @@ def _late(base: Fit) -> set[str]:
     return {f"{kind}_of_{n}" for kind in ("delay", "lag") for n in base.model.input_names}
 
 
-def _of_whole(known: Known, task: Task) -> Known | None:
+def _of_whole(known: SearchState, task: Task) -> SearchState | None:
     """Return what was found in parts of records as hypotheses of whole ones.
 
     None where what was found does not follow these.
@@ -327,8 +328,8 @@ def _of_whole(known: Known, task: Task) -> Known | None:
         if not best.causes or not follows(top, task.experiments):
             return None
         base = fit_longer_parts(known.root.fit, parts, task.experiments)
-        result = Known(levelled(base, task.experiments)[0], task)
-        for h in (h for h in known.found.values() if h.causes and h.final):
+        result = SearchState(levelled(base, task.experiments)[0], task)
+        for h in (h for h in known.hypotheses.values() if h.causes and h.final):
             with suppress(PsaError):
                 fit = top if h is best else fit_longer_parts(h.fit, parts, task.experiments)
                 result.note(hypothesis(h.causes, fit, task.experiments, final=True))

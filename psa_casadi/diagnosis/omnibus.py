@@ -13,7 +13,7 @@ from psa_casadi.units import FloatArray
 
 #: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive, or
 #: the residual what some effect would add.
-Seen = Literal["correlation", "line", "drive", "size", "effect"]
+Structure = Literal["correlation", "line", "drive", "size", "effect"]
 
 _LAGS = 25
 #: So many times more rarely a correlation counts beside a residual's own colour.
@@ -26,29 +26,29 @@ _MOST = 9.0
 class Omnibus:
     """Probability of the residual under noise alone, and the test that says so.
 
-    `seen` is what that test sees, `output` the one of several whose residual it is. `excess` is the
-    share of the residual's power above the noise; `size` [m] the rms of what the test sees,
-    `knowable` [m] that below which nothing can be told of a stack, `alarms_below` the probability
-    from which on it does not alarm.
+    `structure` is what that test finds, `output` the one of several whose residual it is. `excess`
+    is the share of the residual's power above the noise; `size` [m] the rms of what the test finds,
+    `detection_limit` [m] the rms below which nothing of a stack counts, `alarms_below` the
+    probability from which on the test does not alarm.
     """
 
     p_value: float
     excess: float
-    seen: Seen
+    structure: Structure
     size: float
-    knowable: float
+    detection_limit: float
     alarms_below: float
     output: str = ""
 
     @property
     def alarm(self) -> bool:
         """Whether something besides noise is in the residual, large enough to be told."""
-        return self.p_value < self.alarms_below and self.size > self.knowable
+        return self.p_value < self.alarms_below and self.size > self.detection_limit
 
     @property
     def finding(self) -> Note:
         """What is in the residual besides noise, where the test alarms."""
-        return note("structure", seen=self.seen, output=self.output, excess=self.excess)
+        return note("structure", seen=self.structure, output=self.output, excess=self.excess)
 
 
 def omnibus(
@@ -59,7 +59,7 @@ def omnibus(
     floor: float,
     *,
     lengths: Sequence[int],
-    knowable: float,
+    detection_limit: float,
     own: bool,
     alarms_below: float,
 ) -> Omnibus:
@@ -75,7 +75,7 @@ def omnibus(
     """
     white = colour.whiten(residual)
     p, share = whiteness(white)
-    tests: dict[Seen, tuple[float, float]] = {
+    tests: dict[Structure, tuple[float, float]] = {
         "correlation": (min(1.0, _LEFT * p) if own else p, share),
         "line": _fisher_line(white),
         "drive": _features(white, voltage, time, colour),
@@ -87,7 +87,7 @@ def omnibus(
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, observed, size, knowable, alarms_below)
+    return Omnibus(p, excess, observed, size, detection_limit, alarms_below)
 
 
 def whiteness(white: FloatArray) -> tuple[float, float]:

@@ -75,7 +75,7 @@ class OwnColour:
         """It as the colour of the fitted samples, which begins anew after every gap."""
         each = (self.autoregression,) * len(self.runs)
         level = max(self.level, 1e-15)
-        return Colour(each, level, self.runs, begins=False, spread=self.spread)
+        return Colour(each, level, self.runs, known_start=False, spread=self.spread)
 
     @property
     def tested(self) -> tuple[FloatArray, Colour]:
@@ -137,9 +137,8 @@ def own_colour(
                 return  # the fit is the likeliest one already
             white = _innovations(columns, at, a) / spread[at, None]
             share = (result.level / max(rms(left[used]), 1e-300)) ** 2
-            normal = (
-                white.T @ white + share * started.T @ started + np.diag(result.level**2 * weight)
-            )
+            normal = white.T @ white + share * started.T @ started
+            normal += np.diag(result.level**2 * weight)
             along = white.T @ new + share * started.T @ left[first]
             left = left - columns @ np.linalg.lstsq(normal, along, rcond=1e-12)[0]
 

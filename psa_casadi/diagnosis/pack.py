@@ -7,15 +7,12 @@ import numpy as np
 
 from psa_casadi.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.diagnosis.colour import Colour, noise_rms
-from psa_casadi.diagnosis.noise import knowable_of, known_colour
+from psa_casadi.diagnosis.noise import detection_limit_of
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
-from psa_casadi.diagnosis.own_colour import OwnColour
-from psa_casadi.diagnosis.process_noise import entering
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import relevelled
 from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
@@ -28,31 +25,10 @@ _CURVE = 8
 _SHARP, _WIDTHS = 0.05, 2.0
 
 
-@dataclass(frozen=True)
 class Pack:
-    """Any model: several inputs and outputs, of which nothing else is known.
+    """Any model: several inputs and outputs, of which nothing else is known."""
 
-    Where noise of some colour tells the residual of its base, it `asks_effects` for what one of
-    them would lower.
-    """
-
-    asks_effects: bool = True
-
-    def fast(self, experiments: Sequence[Experiment]) -> bool:
-        """Return whether the device may ring within a record's band."""
-        return False
-
-    def alike(
-        self, experiments: Sequence[Experiment], table: Sequence[Component], fit: Fit
-    ) -> tuple[tuple[str, ...], ...]:
-        """Return groups of effects that these records cannot tell apart but by unknown forms."""
-        return ()
-
-    def colours(
-        self, fit: Fit, experiments: Sequence[Experiment]
-    ) -> list[FloatArray | None] | None:
-        """Return the colour of every record's noise where it is known without a model."""
-        return None
+    is_stack = False
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
@@ -73,7 +49,8 @@ class Pack:
             for along in moving or [np.zeros(len(left))]:
                 result = omnibus(
                     left, along, np.concatenate(time), noise, noise_rms(f.residuals, noise),
-                    lengths=f.lengths, knowable=f.straight, own=own, alarms_below=limits.alarm,
+                    lengths=f.lengths, detection_limit=f.straight, own=own,
+                    alarms_below=limits.alarm,
                 )  # fmt: skip
                 rows.append(replace(result, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
@@ -85,63 +62,20 @@ class Pack:
         """Return whether what a direction promises to remove can be told of the device."""
         return any(f.rms > f.straight for f in fit.channels)
 
-    def told(self, fit: Fit, before: Fit, removed: float, knowable: float) -> bool:
-        """Return whether a fit removes more of another one's error than what cannot be told."""
+    def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
+        """Return whether a fit removes more of another one's error than the detection limit."""
         pairs = zip(fit.channels, before.channels, strict=True)
         return any(old.rms**2 - new.rms**2 > new.straight**2 for new, old in pairs)
 
-    def in_character(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
         """Return whether the data ask for this effect and not for something else."""
         return cause.is_inside_ranges(fit.model.values)
 
-    def remembers(
-        self, added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment],
-        limits: Thresholds,
-    ) -> bool:  # fmt: skip
-        """Return whether what a memory adds (n,) is more than a static curve of an input."""
-        return True
 
-    def entering(
-        self, fit: Fit, experiments: Sequence[Experiment], arrays: Sequence[FloatArray],
-        item: tuple[OwnColour, ...],
-    ) -> tuple[OwnColour, ...]:  # fmt: skip
-        """Return the noise of every channel, where it enters the model if that is likelier."""
-        return tuple(
-            entering(
-                fit, experiments,
-                [e.errors(f.number, y[:, k]) for e, y in zip(experiments, arrays, strict=True)],
-                k, colour,
-            )
-            for k, (f, colour) in enumerate(zip(fit.channels, item, strict=True))
-        )  # fmt: skip
-
-    def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
-        """Return a fit at its end, with the noise that it leaves of every output."""
-        return relevelled(fit, experiments, every=True)[0]
-
-
-@dataclass(frozen=True)
 class StackPack(Pack):
     """A stack: one voltage, a displacement and columns beside it."""
 
-    asks_effects: bool = False
-
-    def fast(self, experiments: Sequence[Experiment]) -> bool:
-        """Return whether a stack may ring within a record's band."""
-        return shows_ringing(experiments)
-
-    def alike(
-        self, experiments: Sequence[Experiment], table: Sequence[Component], fit: Fit
-    ) -> tuple[tuple[str, ...], ...]:
-        """Return groups of effects that bend the same curve."""
-        return same_curves(experiments, table, fit)
-
-    def colours(
-        self, fit: Fit, experiments: Sequence[Experiment]
-    ) -> list[FloatArray | None] | None:
-        """Return the colour of every record's noise where repeats tell it."""
-        residuals = fit.residuals_of(experiments)
-        return [known_colour(e.record, r) for e, r in zip(experiments, residuals, strict=True)]
+    is_stack = True
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
@@ -159,82 +93,47 @@ class StackPack(Pack):
             noise = noise_rms(residual, of)
             return omnibus(
                 residual, voltage, time, of, noise,
-                lengths=[int(e.used.sum()) for e in parts], knowable=least, own=own,
+                lengths=[int(e.used.sum()) for e in parts], detection_limit=least, own=own,
                 alarms_below=limits.alarm,
             )  # fmt: skip
 
         first, *others = residuals
-        test = test_of(first, experiments, colour, knowable_of(fit, experiments, limits))
+        test = test_of(first, experiments, colour, detection_limit_of(fit, experiments, limits))
         for f, left, of in zip(fit.further, others, colour.further, strict=True):
             if test.alarm:
                 break
             result = test_of(left, [experiments[k] for k in f.records], of, f.straight)
-            p = min(1.0, result.p_value * (1 + len(fit.further)))
+            p, least = min(1.0, result.p_value * (1 + len(fit.further))), test.detection_limit
             if result.alarm and p < limits.alarm:
-                size = max(test.size, 2.0 * test.knowable)
-                test = replace(
-                    result, p_value=p, size=size, knowable=test.knowable, output=f.column
-                )
+                size = max(test.size, 2.0 * least)
+                test = replace(result, p_value=p, size=size, detection_limit=least, output=f.column)
         return test
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
         """Return whether the power [m^2] that a direction promises to remove can be told."""
-        return promise > test.knowable**2
+        return promise > test.detection_limit**2
 
-    def told(self, fit: Fit, before: Fit, removed: float, knowable: float) -> bool:
-        """Return whether more power is removed [m^2] than can be told."""
-        return removed > knowable**2
+    def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
+        """Return whether the `removed` power [m^2] exceeds that of the limit `least` [m]."""
+        return removed > least**2
 
-    def in_character(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
         """Return whether the data ask for this effect and not for something else.
 
         Not with a parameter pushed to the end of its range, a tone among the harmonics of a
         periodic drive (a hum at the mains' frequency may lie between them), a hum where the stack
         itself rings, or a period over the displacement that fits into it less than twice.
         """
-        values = fit.model.values
+        values, tone, hum = fit.model.values, cause.tone, cause.belongs_to == "environment"
         widest = max(e.record.range_m for e in experiments)
         periods = [values[n] for n, grid in cause.probe.items() if grid == DISPLACEMENT_PEAKS]
         if any(period > 0.5 * widest for period in periods):
             return False
-        tone = cause.tone
-        hum = cause.belongs_to == "environment"
-        if tone is not None and not all(
-            is_tone_separable(values[tone], e.record, hum=hum) for e in experiments
-        ):
-            return False
-        if tone is not None and hum and _rings_at(fit, values[tone]):
-            return False
+        if tone is not None:
+            distinct = all(is_tone_separable(values[tone], e.record, hum=hum) for e in experiments)
+            if not distinct or (hum and _rings_at(fit, values[tone])):
+                return False
         return cause.is_inside_ranges(values)
-
-    def remembers(
-        self, added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment],
-        limits: Thresholds,
-    ) -> bool:  # fmt: skip
-        """Return whether what a memory adds is more than a curve of the voltage.
-
-        At most `static` of the power that the other's parameters cannot follow may be one. Elements
-        that are wider than the voltage's way are such a curve.
-        """
-        change = np.concatenate([a[e.used] for a, e in zip(added, experiments, strict=True)])
-        voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
-        basis = independent(before.jacobian)
-        target = without(change, basis)
-        place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
-        curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
-        static = independent(without(curves, basis)).T @ target
-        return float(static @ static) < limits.static * float(target @ target)
-
-    def entering(
-        self, fit: Fit, experiments: Sequence[Experiment], arrays: Sequence[FloatArray],
-        item: tuple[OwnColour, ...],
-    ) -> tuple[OwnColour, ...]:  # fmt: skip
-        """Return the noise as it is: that of any colour is the sensor's."""
-        return item
-
-    def ended(self, fit: Fit, experiments: Sequence[Experiment]) -> Fit:
-        """Return the fit as it is: levels of columns are those of the base."""
-        return fit
 
 
 #: The stack of a diagnosis of records that come without a model of one's own.
@@ -268,11 +167,29 @@ class Task:
     @property
     def fast(self) -> bool:
         """Whether the device may ring within a record's band."""
-        return self.pack.fast(self.experiments)
+        return self.pack.is_stack and shows_ringing(self.experiments)
 
-    def alike(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
+    def indistinguishable(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot tell apart but by forms nobody knows."""
-        return self.pack.alike(self.experiments, self.table, fit)
+        return same_curves(self.experiments, self.table, fit) if self.pack.is_stack else ()
+
+
+def is_dynamic(
+    added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment], limits: Thresholds
+) -> bool:
+    """Return whether what a memory adds (n,) is more than a curve of a stack's voltage.
+
+    At most `static` of the power that the other's parameters cannot follow may be one. Elements
+    that are wider than the voltage's way are such a curve.
+    """
+    change = np.concatenate([a[e.used] for a, e in zip(added, experiments, strict=True)])
+    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    basis = independent(before.jacobian)
+    target = without(change, basis)
+    place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)
+    curves = np.cos(np.pi * np.outer(place, np.arange(1, _CURVE + 1)))
+    static = independent(without(curves, basis)).T @ target
+    return float(static @ static) < limits.static * float(target @ target)
 
 
 def _rings_at(fit: Fit, frequency: float) -> bool:

@@ -36,19 +36,11 @@ from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.noise import peaks as highest_peaks
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
+from psa_casadi.simulation import tangent
 from psa_casadi.simulation.exact.run import NotExact, time_steps
 from psa_casadi.simulation.side_by_side import compiled, side_by_side
 from psa_casadi.simulation.simulate import Way, record_inputs
 from psa_casadi.simulation.start import is_stack, memory_names
-from psa_casadi.simulation.tangent import (
-    Answer,
-    Course,
-    Law,
-    answer,
-    course_of,
-    law_of,
-    opened,
-)
 from psa_casadi.units import FloatArray
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
@@ -65,22 +57,18 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     Samples that do not count are 0, so that a line keeps its phase across them. The range of a
     periodic drive's harmonics is left out, since it may be distortion, but for the mains.
     """
-    experiment = experiments[0]
-    count = experiment.stop
-    used = experiment.used[:count]
+    record, count = experiments[0].record, experiments[0].stop
+    used = experiments[0].used[:count]
     residual = np.zeros(count)
     residual[used] = fit.residuals[: int(used.sum())]
     residual[used] -= np.mean(residual[used])
     power = np.abs(np.fft.rfft(residual * np.hanning(count), _FINER * count)) ** 2
-    frequency = np.fft.rfftfreq(_FINER * count, experiment.record.sample_time)
+    frequency = np.fft.rfftfreq(_FINER * count, record.sample_time)
     lowest, apart = _FINER * max(8, count // 200), _FINER * max(3, count // 200)
     order = highest_peaks(power[lowest:], apart, 5 * _PEAKS) + lowest
-    record = experiment.record
     tones = [k for k in order if is_tone_separable(frequency[k], record, hum=True)]
-    strongest = np.array(tones[:_PEAKS], dtype=int)
-    return tuple(float(f) for f in np.sort(frequency[strongest])) or (
-        0.1 / experiment.record.sample_time,
-    )
+    strongest = np.sort(frequency[np.array(tones[:_PEAKS], dtype=int)])
+    return tuple(strongest.tolist()) or (0.1 / record.sample_time,)
 
 
 def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
@@ -95,7 +83,7 @@ def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     power = np.abs(np.fft.rfft(mean * np.hanning(_BINS), _FINER * _BINS)) ** 2
     first = _FINER * _FEWEST_PERIODS
     order = highest_peaks(power[first : _FINER * _MOST_PERIODS], 3 * _FINER, _PEAKS) + first
-    return tuple(float(p) for p in np.sort(span * _FINER / order))
+    return tuple(np.sort(span * _FINER / order).tolist())
 
 
 def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
@@ -111,12 +99,11 @@ def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     edges = np.arange(_SIDE, _BINS - _SIDE + 1)
     left, right = (below[edges + k] - below[edges + k - _SIDE] for k in (0, _SIDE))
     before, after = (sums[edges + k] - sums[edges + k - _SIDE] for k in (0, _SIDE))
-    observed = np.minimum(left, right) > 0
+    both = np.minimum(left, right) > 0
     jump = after / np.maximum(right, 1) - before / np.maximum(left, 1)
-    power = np.where(observed, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
+    power = np.where(both, jump**2 * left * right / np.maximum(left + right, 1), 0.0)
     places = edges[highest_peaks(power, _SIDE, _PEAKS)]
-    result = low + span * np.sort(places) / _BINS
-    return tuple(float(x) for x in result)
+    return tuple((low + span * np.sort(places) / _BINS).tolist())
 
 
 def _binned(
@@ -131,8 +118,8 @@ def _binned(
     for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
         if e.held_out_whole:
             continue
-        displayed = measured(e.record)[: e.stop][e.used[: e.stop]]
-        parts.append((displayed - residual - fit.offset(k), residual))
+        reading = measured(e.record)[: e.stop][e.used[: e.stop]]
+        parts.append((reading - residual - fit.offset(k), residual))
     x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))
     low, span = float(x.min()), float(np.ptp(x))
     places = (_BINS * (x - low) / max(span, 1e-300)).astype(np.int64)
@@ -142,6 +129,12 @@ def _binned(
     return low, span, count, total
 
 
+#: What is read off the residual, by the name that a probe has for it.
+_FROM_RESIDUAL = {
+    SPECTRAL_PEAKS: residual_peaks,
+    DISPLACEMENT_PEAKS: residual_periods,
+    DISPLACEMENT_STEPS: residual_jumps,
+}
 _RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
 #: A column along the course of a fit counts where the fitted parameters leave so many times of it
 #: what it may err by; else the effect is simulated.
@@ -186,13 +179,8 @@ def directions(
     Without `finite_steps` only derivatives are taken, which some effects have not at their null.
     They are simulated side by side.
     """
-    peaks = {}
-    if any(SPECTRAL_PEAKS in e.probe.values() for e in effects):
-        peaks[SPECTRAL_PEAKS] = residual_peaks(fit, experiments)
-    if any(DISPLACEMENT_PEAKS in e.probe.values() for e in effects):
-        peaks[DISPLACEMENT_PEAKS] = residual_periods(fit, experiments)
-    if any(DISPLACEMENT_STEPS in e.probe.values() for e in effects):
-        peaks[DISPLACEMENT_STEPS] = residual_jumps(fit, experiments)
+    grids = [grid for e in effects for grid in e.probe.values()]
+    peaks = {n: of(fit, experiments) for n, of in _FROM_RESIDUAL.items() if n in grids}
     tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
     composed = {e.name: fit.model.with_effect(e) for e in effects}
     # else all cores wait for the first one's model, of which there are several tasks
@@ -242,7 +230,7 @@ def laws_of(
     effects: Sequence[Component],
     *,
     finite_steps: bool = True,
-) -> dict[str, Law]:
+) -> dict[str, tangent.Law]:
     """Return the laws of the effects that are not simulated in full, by name.
 
     Of records on even times with straight lines between the samples alone; of effects that are
@@ -253,7 +241,7 @@ def laws_of(
         for r in records:
             time_steps(r.time)
         for e in effects if all(r.hold == "linear" for r in records) else ():
-            law = law_of(model.with_effect(e).structure, e)
+            law = tangent.law_of(model.with_effect(e).structure, e)
             steps = finite_steps and any(e.finite_step)
             if law is not None and (law.forward or not steps):
                 table[e.name] = law
@@ -261,10 +249,10 @@ def laws_of(
 
 
 def screened_with(
-    model: Model, effects: Sequence[Component], laws: Mapping[str, Law]
+    model: Model, effects: Sequence[Component], laws: Mapping[str, tangent.Law]
 ) -> list[Model]:
     """Return the models that a screening simulates, beside the one that it is of."""
-    added = opened(model, laws.values())
+    added = tangent.opened(model, laws.values())
     whole = [model.with_effect(e) for e in effects if e.name not in laws]
     return [added, *whole] if added is not model else whole
 
@@ -273,19 +261,19 @@ class _Beside:
     """What effects add along the course of a fit, those of the `laws` without a model of theirs."""
 
     def __init__(
-        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, Law]
+        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, tangent.Law]
     ) -> None:
-        self.laws, self.opened = laws, opened(fit.model, laws.values())
+        self.laws, self.opened = laws, tangent.opened(fit.model, laws.values())
         self.outputs, starts = outputs_of(experiments[0].channels), fit.starts()
         jacobian = fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
         self.fitted = np.linalg.qr(jacobian)[0]
 
-        def course(k: int) -> Course | None:
+        def course(k: int) -> tangent.Course | None:
             e = experiments[k]
             if not e.stop or not laws:
                 return None
             t, u = e.record.time[: e.stop], record_inputs(fit.model, e.record, e.stop)
-            return course_of(
+            return tangent.course_of(
                 fit.model, t - t[0], u, starts[k],
                 way=fit.way, hold=e.record.hold, outputs=self.outputs,
             )  # fmt: skip
@@ -295,18 +283,18 @@ class _Beside:
     def answer(
         self, model: Model, e: Experiment, k: int, memory: Mapping[str, float], way: Way,
         *, finite: bool,
-    ) -> Answer:  # fmt: skip
+    ) -> tangent.Answer:  # fmt: skip
         """Return what the last effect of a model makes of one record's outputs."""
         course = self.courses[k]
         if course is None:
             raise ValueError("a record that is held out whole has no course")
         law = self.laws[model.components[-1].name]
-        return answer(
+        return tangent.answer(
             self.opened, law, model, course, record_inputs(model, e.record, e.stop), memory,
             finite=finite, way=way, outputs=self.outputs,
         )  # fmt: skip
 
-    def tells(self, columns: FloatArray, error: float) -> bool:
+    def is_clear(self, columns: FloatArray, error: float) -> bool:
         """Whether what the fitted parameters leave of every column is clear of its error."""
         left = columns - self.fitted @ (self.fitted.T @ columns)
         sizes = np.linalg.norm(left, axis=0) - _CLEAR * error * np.linalg.norm(columns, axis=0)
@@ -316,19 +304,18 @@ class _Beside:
 def _probe_values(
     effect: Component, experiments: Sequence[Experiment], peaks: Mapping[str, tuple[float, ...]]
 ) -> Iterator[dict[str, float]]:
-    longest = max(e.record.duration for e in experiments)
     grids: list[tuple[float, ...]] = []
     probe = {n: grid for n, grid in effect.probe.items() if n not in effect.linear}
     for name, grid in probe.items():
         if grid == RECORD_DURATION:
-            grids.append((longest,))
+            grids.append((max(e.record.duration for e in experiments),))
         elif isinstance(grid, str):
             low, high = next(p.bounds for p in effect.parameters if p.name == name)
-            places = [f for f in peaks[grid] if low < f < high]
+            places = tuple(f for f in peaks[grid] if low < f < high)
             if grid == SPECTRAL_PEAKS and effect.belongs_to != "environment":
                 first = experiments[0].record  # a resonance answers at the drive's harmonics only
-                places = [f for f in places if is_tone_separable(f, first, hum=False)]
-            grids.append(tuple(places))
+                places = tuple(f for f in places if is_tone_separable(f, first, hum=False))
+            grids.append(places)
         else:
             grids.append(grid)
     for point in product(*grids):
@@ -356,13 +343,12 @@ def _directions_at(
     for memory in _histories(fit, experiments, effect, model):
         for step in steps:
             try:
-                result = None
+                arguments, clear = (fit, experiments, model, moved, memory, step), False
                 if effect.name in alongside.laws:
-                    columns, further, error = _changes(
-                        fit, experiments, model, moved, memory, step, alongside
-                    )
-                    result = (columns, further) if alongside.tells(columns, error) else None
-                columns, further = result or changes(fit, experiments, model, moved, memory, step)
+                    columns, further, error = _changes(*arguments, alongside)
+                    clear = alongside.is_clear(columns, error)
+                if not clear:
+                    columns, further = changes(*arguments)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
@@ -370,12 +356,10 @@ def _directions_at(
                 every = np.concatenate([column, *others])
                 if not np.all(np.isfinite(every)) or not np.any(every):
                     continue
-                if effect.linear:
-                    weight, item, unit = name, {**values, name: size}, 1.0
-                else:
-                    weight, item, unit = "", values, step or size
+                weight, unit = (name, 1.0) if effect.linear else ("", step or size)
+                trial = {**values, name: size} if effect.linear else values
                 yield Direction(
-                    effect, item, memory, unit, column, one_sided, bool(step), others, weight
+                    effect, trial, memory, unit, column, one_sided, bool(step), others, weight
                 )
 
 
@@ -384,18 +368,16 @@ def _histories(
 ) -> list[tuple[dict[str, float], ...]]:
     """The effect's memories at rest, and for settling ones also as after long cycling."""
     known = fit.starts()
-    settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
-    settling = settling if is_stack(model) else []
-    variants = [tuple(known)]
-    if settling:
-        cycled = []
-        for memory, e in zip(known, experiments, strict=True):
-            y = measured(e.record)[e.known]
-            cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
-        variants.append(tuple(cycled))
     if effect.trial_starts:
         return [tuple({**k, **trial} for k in known) for trial in effect.trial_starts]
-    return variants
+    settling = [s.name for s in effect.states if s.memory and s.settles and s.unit == "m"]
+    if not settling or not is_stack(model):
+        return [tuple(known)]
+    cycled = []
+    for memory, e in zip(known, experiments, strict=True):
+        y = measured(e.record)[e.known]
+        cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
+    return [tuple(known), tuple(cycled)]
 
 
 def changes(
@@ -430,11 +412,11 @@ def _changes(
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
-    def changed(k: int) -> Answer:
+    def changed(k: int) -> tangent.Answer:
         """Return outputs after the step, or their changes along the derivatives (n, outputs, m)."""
         e, way = experiments[k], Way(rtol, rtol)
         if not e.stop:
-            return Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
+            return tangent.Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
         if others is not None:
             item = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
             return item if step else replace(item, y=item.y * sizes)
@@ -442,7 +424,7 @@ def _changes(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=way, by_start=False, outputs=outputs,
         )  # fmt: skip
-        return Answer(traced.y[:, :, None] if step else traced.sensitivity * sizes, 0.0)
+        return tangent.Answer(traced.y[:, :, None] if step else traced.sensitivity * sizes, 0.0)
 
     outputs = outputs_of(experiments[0].channels)
     every, columns = [changed(k) for k in range(len(experiments))], []
@@ -517,20 +499,17 @@ class Span:
     @cached_property
     def information(self) -> FloatArray:
         """W'W (m, m)."""
-        values: FloatArray = self.norms[:, None] * self.gram * self.norms
-        return values
+        return self.norms[:, None] * self.gram * self.norms
 
     @cached_property
     def covariance(self) -> FloatArray:
         """That of the weights (m, m), with their prior."""
         weighted = self.information + np.eye(len(self.norms)) / LINEAR_PRIOR**2
-        values: FloatArray = np.linalg.inv(weighted).astype(np.float64)
-        return values
+        return np.linalg.inv(weighted).astype(np.float64)
 
     def gains(self, t: FloatArray) -> FloatArray:
         """Return the weights (..., m), in ordinary sizes, that fit best."""
-        values: FloatArray = (t * self.norms) @ self.covariance
-        return values
+        return (t * self.norms) @ self.covariance
 
     def decrease(self, t: FloatArray) -> FloatArray:
         """Return D (...), less what noise makes of more weights than one, at least 0.
@@ -545,11 +524,9 @@ class Span:
     def surplus(self) -> float:
         """What a chi-square that is passed as rarely as a false alarm is above that of one."""
         freedom = max(float(np.sum(self.covariance * self.information)), 1.0)
-        share = self.false_alarm
-        largest, of_one = (
-            2.0 * float(scipy.special.gammainccinv(0.5 * f, share)) for f in (freedom, 1.0)
-        )
-        return largest - of_one
+        halves = np.array([0.5 * freedom, 0.5])
+        largest, of_one = 2.0 * scipy.special.gammainccinv(halves, self.false_alarm)
+        return float(largest - of_one)
 
     @cached_property
     def penalties(self) -> FloatArray:

@@ -67,7 +67,7 @@ class _Noises:
         """Return one of them."""
         return _Noises(self.place[[k]], self.power[[k]], self.time[[k]])
 
-    def beside(self, k: int) -> "_Noises":
+    def neighbours(self, k: int) -> "_Noises":
         """Return those near one of them."""
         power, time = np.meshgrid(self.power[k] * _FINER**2, self.time[k] * _FINER)
         return _Noises(np.full(power.size, self.place[k]), power.ravel(), time.ravel())
@@ -105,7 +105,7 @@ def entering(
     if not tried.place.size or not few:
         return item
     chosen = _found(few, observed, tried, prior).nats(np.flatnonzero(np.concatenate(observed)))
-    tried = tried.beside(int(np.argmax(chosen)))
+    tried = tried.neighbours(int(np.argmax(chosen)))
     result = _found(parts, used, tried, prior)
     best = int(np.argmax(result.nats(at)))
     gained = float(result.nats(at)[best]) - price_of(_ORDER, len(at)) - item.nats()

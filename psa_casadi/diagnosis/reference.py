@@ -214,19 +214,19 @@ class Healthy:
 class Since:
     """New records with what the sound device adds to the base on them, `added` (n,) [m].
 
-    Only samples count whose voltage is `shown` (n,) by healthy records; all of it was found at
+    Only samples count whose voltage is `covered` (n,) by healthy records; all of it was found at
     `places` among these.
     """
 
     healthy: Healthy
     records: tuple[Record, ...]
     added: tuple[FloatArray, ...]
-    shown: tuple[BoolArray, ...]
+    covered: tuple[BoolArray, ...]
     places: int
 
     def taken_off(self, first: int) -> tuple[tuple[Record, ...], tuple[Record, ...]]:
         """Return the new records without it, the first so many and the others."""
-        rows = zip(self.records, self.added, self.shown, strict=True)
+        rows = zip(self.records, self.added, self.covered, strict=True)
         result = tuple(
             replace(r, displacement=np.where(s, measured(r) - a, np.nan)) for r, a, s in rows
         )
@@ -270,7 +270,7 @@ class Since:
             result = diagnosed(self.deaf(method, self.open), ())
         items = [
             note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
-                 shown=float(np.mean(np.concatenate(self.shown))))
+                 shown=float(np.mean(np.concatenate(self.covered))))
         ]  # fmt: skip
         best = None if result.verdict in _NOTHING else self._moved(result)
         if best is not None:
@@ -353,7 +353,7 @@ def _ridge(columns: FloatArray, target: FloatArray, which: npt.NDArray[np.intege
         values[on] = s * np.linalg.solve(matrix, s * c[on])
         return values
 
-    def missed(sizes: FloatArray) -> float:
+    def held_out_error(sizes: FloatArray) -> float:
         left = 0.0
         for g, c, p in zip(squares, along, power, strict=True):
             w = solved(sizes, total - g, whole_along - c)
@@ -361,14 +361,14 @@ def _ridge(columns: FloatArray, target: FloatArray, which: npt.NDArray[np.intege
         return left
 
     sizes = np.zeros(int(which.max(initial=0)) + 1)
-    best = missed(sizes)
+    best = held_out_error(sizes)
     for _ in range(_ROUNDS):
         before = best
         for k in range(sizes.size):
             for s in _SIZES:
                 trial = sizes.copy()
                 trial[k] = s
-                left = missed(trial)
+                left = held_out_error(trial)
                 if left < best:
                     best, sizes = left, trial
         if best > (1.0 - _GAIN) * before:

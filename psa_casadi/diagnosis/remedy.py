@@ -80,19 +80,13 @@ def drive_of(model: Model, effect: Component, records: Sequence[Record]) -> Driv
         x0 = None if run is None else _state(model, run.start)
         plays.append((r.time, record_inputs(model, r, r.n), x0))
     if known is not None and known.seen.rate > 0:
-        observed = known.seen
         if not plays and known.reference is not None:
-            result, run = known.reference, known.run_of(known.reference.record)
-            inputs = {n: np.array(v) for n, v in result.inputs.items() if n in model.input_names}
+            play, run = known.reference, known.run_of(known.reference.record)
+            inputs = {n: np.array(v) for n, v in play.inputs.items() if n in model.input_names}
             x0 = None if run is None else _state(model, run.start)
-            plays = [(np.array(result.time), input_samples(model, len(result.time), inputs), x0)]
-        return Drive(
-            observed.voltage.low,
-            observed.voltage.high,
-            observed.rate,
-            observed.duration,
-            tuple(plays),
-        )
+            plays = [(np.array(play.time), input_samples(model, len(play.time), inputs), x0)]
+        low, high = known.seen.voltage.low, known.seen.voltage.high
+        return Drive(low, high, known.seen.rate, known.seen.duration, tuple(plays))
     high = model.values["u_rated"] / (model.values["G"] or 1.0)
     time, voltage = standard_voltage(_PERIOD, high)
     inputs = {"voltage": voltage}
@@ -114,8 +108,7 @@ def _shown(model: Model, t: FloatArray, u: FloatArray, x0: FloatArray | None = N
     """Return what a model shows (n,), from rest if no start is given."""
     started = start_on(model, t, u).x if x0 is None else x0
     steps, _ = accurate(model, t, u, started, rtol=_RTOL, hold="linear")
-    y: FloatArray = steps.y[:, model.output_names.index(output_of(model) or "displacement")]
-    return y
+    return steps.y[:, model.output_names.index(output_of(model) or "displacement")]
 
 
 def _played(
@@ -180,15 +173,15 @@ def _resonance(on: Model, off: Model, drive: Drive) -> list[Figure]:
     poles = np.linalg.eigvals(with_it.a)
     ringing = np.unique(np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]))
     near = np.geomspace(0.9, 1.1, _SAMPLES + 1)  # the peak lies beside the pole
-    items = []
+    figures = []
     for natural in ringing.tolist():
         omega = natural * near
         ratio = np.abs(with_it.response(omega) / without.response(omega))
         best = int(np.argmax(np.abs(np.log(ratio))))
         if abs(float(np.log(ratio[best]))) > _TOLD:
             at = float(omega[best]) / (2.0 * np.pi)
-            items.append(Figure("resonance", float(ratio[best]), "1", at, "Hz"))
-    return sorted(items, key=lambda f: -abs(float(np.log(f.value))))[:_MOST]
+            figures.append(Figure("resonance", float(ratio[best]), "1", at, "Hz"))
+    return sorted(figures, key=lambda f: -abs(float(np.log(f.value))))[:_MOST]
 
 
 def _record(on: Model, off: Model, drive: Drive) -> list[Figure]:
@@ -256,18 +249,18 @@ def sizes(
     off = model.with_values({effect.gain or "": 0.0})
     test = TESTS[effect.what_now.test]
     try:
-        omnibus = test(model, off, drive)
-        interval = _intervals(effect, model, omnibus, lambda changed: test(changed, off, drive))
+        figures = test(model, off, drive)
+        interval = _intervals(effect, model, figures, lambda changed: test(changed, off, drive))
     except PsaError:
         return ()
-    if not np.isfinite([f.value for f in omnibus]).all():
+    if not np.isfinite([f.value for f in figures]).all():
         return ()
     return tuple(
         Size(
             f.test, f.value, f.unit or unit, within, f.at, f.at_unit, (drive.low, drive.high),
             f.test == "hold" and f.at > drive.longest,
         )
-        for f, within in zip(omnibus, interval, strict=True)
+        for f, within in zip(figures, interval, strict=True)
     )  # fmt: skip
 
 

@@ -107,12 +107,12 @@ class Remaining:
 
     white: bool
     p_value: float
-    seen: Note | str = NOISE
+    finding: Note | str = NOISE
 
     @property
     def where(self) -> str:
         """What is seen, as a sentence."""
-        return str(self.seen)
+        return str(self.finding)
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ class Diagnosis(Reported):
         """Where an unnamed correction would remove most of what is left, "" if none does."""
         if self.patch is None:
             return ""
-        return str(note("would_remove", what=self.patch.said, share=self.patch.share))
+        return str(note("would_remove", what=self.patch.label, share=self.patch.share))
 
     @property
     def moved(self) -> tuple[str, ...]:
@@ -285,7 +285,7 @@ class Diagnosis(Reported):
             if self.causes and n in before and not i.low <= before[n] <= i.high
         )  # fmt: skip
 
-    def shown(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+    def predictions(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
         """Return what base and extended model predict of a channel along every record (n,)."""
         (output,) = self.experiments[0].channels[channel].outputs
         k = self.model.output_names.index(output)
@@ -338,8 +338,8 @@ class Diagnosis(Reported):
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "budget": asdict(self.budget),
-            "missed": told(self.missed, "seen", "where"),
-            "remaining": told(self.remaining, "seen", "where"),
+            "missed": with_text(self.missed, "finding", "where"),
+            "remaining": with_text(self.remaining, "finding", "where"),
             "unnamed": self.unnamed,
             "families": [asdict(f) for f in self.families],
             "notes": list(self.notes),
@@ -383,7 +383,7 @@ class StackDiagnosis(Diagnosis):
 
     __repr__ = Reported.__repr__
 
-    def shown(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
+    def predictions(self, channel: int) -> tuple[Sequence[FloatArray], Sequence[FloatArray]]:
         """Return what base and extended model predict of the displacement, channel 0 [m]."""
         return self.base, self.extended
 
@@ -417,9 +417,9 @@ class StackDiagnosis(Diagnosis):
             "gain": asdict(self.gain),
             "patch": None if self.patch is None else self.patch.to_dict(),
             "alternatives": [a.to_dict() for a in self.alternatives],
-            "columns": [told(c, "outcome", "sentence") for c in self.columns],
-            "blind_to": [told(b, "reason", "why") for b in self.blind_to],
-            "next_experiment": told(self.next_experiment, "reasons", "why"),
+            "columns": [with_text(c, "outcome", "sentence") for c in self.columns],
+            "blind_to": [with_text(b, "reason", "why") for b in self.blind_to],
+            "next_experiment": with_text(self.next_experiment, "reasons", "why"),
             "noise": [
                 {"record": n.record, "rms": n.level, "source": n.source, "sentence": n.sentence}
                 for n in self.noise
@@ -429,7 +429,7 @@ class StackDiagnosis(Diagnosis):
         }
 
 
-def told(part: Any, code: str, text: str) -> dict[str, Any]:
+def with_text(part: Any, code: str, text: str) -> dict[str, Any]:
     """Return a part of a result for a file: the sentence in the place of its code."""
     return {
         text if n == code else n: getattr(part, text) if n == code else v

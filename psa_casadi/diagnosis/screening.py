@@ -118,44 +118,37 @@ def screen(
     residual = without(whitened_residuals(fit, colour), white_basis)
     whole = colour.whiten_all(columns, arrays)
     white = without(whole, white_basis)
-    raw = np.linalg.norm(whole, axis=0)
     norm = np.linalg.norm(white, axis=0)
-    usable = norm > 1e-6 * raw
+    usable = norm > 1e-6 * np.linalg.norm(whole, axis=0)
     norm = np.where(usable, norm, 1.0)
     unit = np.where(usable, white / norm, 0.0)
     t = unit.T @ residual / colour.level
-    scores, observed = [], []
+    scores, span_places = [], []
     gram = unit.T @ unit
     for places in spans(trials):
-        items = [trials[k] for k in places]
-        if items[0].weight:
+        k, direction = places[0], trials[places[0]]
+        if direction.weight:
             size = norm[places] * usable[places] / colour.level
             span = Span(gram[np.ix_(places, places)], size, limits.false_alarm)
-            observed.append((places, span))
-            scores.append(_of_span(items, span, t[places]))
+            span_places.append((places, span))
+            scores.append(_of_span([trials[k] for k in places], span, t[places]))
             continue
-        k, direction = places[0], items[0]
-        allowed = usable[k] and (t[k] > 0 or not direction.finite)
-        scores.append(
-            Score(
-                direction,
-                float(t[k] ** 2) if allowed else 0.0,
-                float(t[k] * colour.level / norm[k] * direction.unit_gain),
-                float(direction.unit_gain * colour.level / norm[k]) if usable[k] else np.inf,
-            )
-        )
+        decrease = float(t[k] ** 2) if usable[k] and (t[k] > 0 or not direction.finite) else 0.0
+        gain = float(t[k] * colour.level / norm[k] * direction.unit_gain)
+        least = float(direction.unit_gain * colour.level / norm[k]) if usable[k] else np.inf
+        scores.append(Score(direction, decrease, gain, least))
     scores.sort(key=lambda s: -s.decrease)
-    return Screening(tuple(scores), _threshold(gram, observed, limits.false_alarm), colour)
+    return Screening(tuple(scores), _threshold(gram, span_places, limits.false_alarm), colour)
 
 
 def _further(fit: Fit, arrays: Sequence[FloatArray]) -> tuple[Colour, ...]:
     """Return the colours of what neither fit nor directions explain of the further columns."""
-    items = []
+    colours = []
     for f, more in zip(fit.further, arrays, strict=True):
         fitted = independent(f.jacobian)
         every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
-        items.append(colour_of(without(f.residuals, every), f.lengths, None, every))
-    return tuple(items)
+        colours.append(colour_of(without(f.residuals, every), f.lengths, None, every))
+    return tuple(colours)
 
 
 def _of_span(directions: Sequence[Direction], span: Span, t: FloatArray) -> Score:
@@ -217,8 +210,8 @@ def copies(
     power = float(target @ target)
     result: dict[str, Copy] = {}
     for name in dict.fromkeys(d.effect.name for d in trials):
-        items = [d for d in trials if d.effect.name == name]
-        columns = np.column_stack([d.column for d in items])
+        own = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.column for d in own])
         free = without(colour.whiten(columns), basis)
         norms = np.linalg.norm(free, axis=0)
         usable = norms > 1e-6 * np.linalg.norm(columns, axis=0)
@@ -227,7 +220,7 @@ def copies(
         share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
         unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
         along = unit.T @ target / colour.level
-        ways = [_copy(items, p, unit, sizes / colour.level, along, limits) for p in spans(items)]
+        ways = [_copy(own, p, unit, sizes / colour.level, along, limits) for p in spans(own)]
         _, direction, gain = max(ways, key=lambda w: w[0])
         result[name] = Copy(share, direction, gain)
     return power / colour.level**2, result
@@ -242,13 +235,11 @@ def _copy(
     limits: Thresholds,
 ) -> tuple[float, Direction, float]:
     """Return how much of a target a span or a direction explains, and how it does so best."""
-    first = trials[places[0]]
+    first, t, sizes = trials[places[0]], along[places], norms[places]
     if not first.weight:
-        t, norm = float(along[places[0]]), float(norms[places[0]])
-        return t**2, first, t / max(norm, 1e-300) * first.unit_gain
-    span = Span(unit[:, places].T @ unit[:, places], norms[places], limits.false_alarm)
-    item, t_own = [trials[k] for k in places], along[places]
-    return float(span.decrease(t_own)), combined(item, span.gains(t_own)), 1.0
+        return float(t[0]) ** 2, first, float(t[0]) / max(float(sizes[0]), 1e-300) * first.unit_gain
+    span = Span(unit[:, places].T @ unit[:, places], sizes, limits.false_alarm)
+    return float(span.decrease(t)), combined([trials[k] for k in places], span.gains(t)), 1.0
 
 
 def independent(columns: FloatArray) -> FloatArray:
@@ -264,22 +255,20 @@ def independent(columns: FloatArray) -> FloatArray:
         u, s, _ = np.linalg.svd(scaled, full_matrices=False)
     except np.linalg.LinAlgError:  # divide and conquer may fail where the plain method does not
         u, s, _ = scipy.linalg.svd(scaled, full_matrices=False, lapack_driver="gesvd")
-    basis: FloatArray = u[:, s > 1e-7 * s[0]]
-    return basis
+    return u[:, s > 1e-7 * s[0]]
 
 
 def without(vectors: FloatArray, basis: FloatArray) -> FloatArray:
     """Return vectors (samples,) or columns less what an orthonormal basis spans of them."""
-    projected: FloatArray = vectors - basis @ (basis.T @ vectors)
-    return projected
+    return vectors - basis @ (basis.T @ vectors)
 
 
 def _threshold(
-    gram: FloatArray, observed: Sequence[tuple[list[int], Span]], false_alarm: float
+    gram: FloatArray, in_spans: Sequence[tuple[list[int], Span]], false_alarm: float
 ) -> float:
     """Quantile of the largest decrease that white noise makes along directions and spans.
 
-    `gram` is that of the unit directions, `observed` has the places of those that are in spans.
+    `gram` is that of the unit directions, `in_spans` has the places of those in spans.
     """
     if not len(gram):
         return np.inf
@@ -288,8 +277,8 @@ def _threshold(
     noise = np.random.default_rng(_SEED).standard_normal((_DRAWS, len(gram)))
     drawn = noise @ root.T
     single = np.ones(len(gram), dtype=bool)
-    single[[k for places, _ in observed for k in places]] = False
-    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in observed)]
+    single[[k for places, _ in in_spans for k in places]] = False
+    every = [*(drawn[:, single] ** 2).T, *(span.decrease(drawn[:, p]) for p, span in in_spans)]
     largest = np.max(every, axis=0)
     return float(np.quantile(largest, 1.0 - false_alarm))
 
@@ -352,9 +341,9 @@ def _together(
     directions, gains = [], []
     for of_one, sizes in zip(np.split(places, ends), np.split(multiples, ends), strict=True):
         these = [trials[int(k)] for k in of_one]
-        whole = combined(these, sizes) if these[0].weight else these[0]
-        directions.append(whole)
-        gains.append(whole.unit_gain if these[0].weight else float(sizes[0]) * whole.unit_gain)
+        one = combined(these, sizes) if these[0].weight else these[0]
+        directions.append(one)
+        gains.append(one.unit_gain if these[0].weight else float(sizes[0]) * one.unit_gain)
     return Together(tuple(directions), tuple(gains), promise)
 
 
@@ -384,13 +373,13 @@ def best_sets(
     ways, weak, cost = _ways(trials, gram, norm * usable / colour.level, limits)
     gram += np.diag(weak)
     total, n = float(residual @ residual), len(residual)
-    items = []
+    sets = []
     for names in combinations(ways, size):
         if any(len(set(names) & set(group)) > 1 for group in texts):
             continue
-        item = [ways[name] for name in names]
-        grids = np.meshgrid(*(np.arange(len(p)) for p in item), indexing="ij")
-        index = np.hstack([p[g.ravel()] for p, g in zip(item, grids, strict=True)])
+        of_each = [ways[name] for name in names]
+        grids = np.meshgrid(*(np.arange(len(p)) for p in of_each), indexing="ij")
+        index = np.hstack([p[g.ravel()] for p, g in zip(of_each, grids, strict=True)])
         systems = gram[index[:, :, None], index[:, None, :]]
         gains = np.linalg.solve(systems, along[index][:, :, None])[:, :, 0]
         decrease = np.sum(gains * along[index], axis=1)
@@ -399,10 +388,10 @@ def best_sets(
         share = min(float(decrease[best]) / max(total, 1e-300), 1.0 - 1e-9)
         promise = -0.5 * n * float(np.log1p(-share)) - float(np.sum(cost[index[best]]))
         multiples = gains[best] / np.maximum(norm[index[best]], 1e-300)
-        items.append(_together(trials, item, index[best], multiples, promise))
+        sets.append(_together(trials, of_each, index[best], multiples, promise))
     heads = {n: group[0] for group in texts for n in group}
     best_of: dict[frozenset[str], Together] = {}
-    for each in sorted(items, key=lambda t: -t.promise):
+    for each in sorted(sets, key=lambda t: -t.promise):
         best_of.setdefault(frozenset(heads.get(n, n) for n in each.names), each)
     return list(best_of.values())
 
@@ -416,12 +405,9 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     share = max(len(before.residuals) - before.unknowns.size, 0) / len(before.residuals)
     gained = share * _gained(before.residuals, after.residuals, colour)
     gained += sum(further_gains(before, after, colour).values())
-    levels = [_level(after.residuals, colour, 0.0)]
-    levels += [
-        _level(f.residuals, item, f.straight)
-        for item, f in zip(colour.further, after.further, strict=True)
-    ]
-    return gained - occam(before, after, colour, levels)
+    pairs = zip(colour.further, after.further, strict=True)
+    further = [_level(f.residuals, c, f.straight) for c, f in pairs]
+    return gained - occam(before, after, colour, [_level(after.residuals, colour, 0.0), *further])
 
 
 def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> float:
@@ -447,10 +433,7 @@ def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> f
 def further_gains(before: Fit, after: Fit, colour: Colour) -> dict[str, float]:
     """Return what every further column adds to the log-likelihood of a fit over another one."""
     rows = zip(colour.further, before.further, after.further, strict=True)
-    return {
-        new.column: _gained(old.residuals, new.residuals, item, new.straight)
-        for item, old, new in rows
-    }
+    return {n.column: _gained(b.residuals, n.residuals, c, n.straight) for c, b, n in rows}
 
 
 def _gained(before: FloatArray, after: FloatArray, colour: Colour, straight: float = 0.0) -> float:

@@ -12,16 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psa_casadi.component import SPECTRAL_PEAKS, Component
-from psa_casadi.diagnosis.views import (
-    Axis,
-    View,
-    axes,
-    drive_of,
-    ground_of,
-    hold_axis,
-    time_axis,
-    view,
-)
+from psa_casadi.diagnosis import views
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
@@ -41,7 +32,7 @@ _END = 8.2
 #: over the stroke lies between these limits; if none does, by that which comes nearest.
 _FACTORS = (1.0, 3.0, 0.3, 10.0, 0.1, 0.03, 0.02, 30.0, 100.0)
 _PLAIN = (3e-3, 3e-2)
-#: Everything is a function of time: another coordinate is told where it has this share of it.
+#: Everything is a function of time: another coordinate is weight where it has this share of it.
 _RATHER = 0.8
 #: Warming [K] during a play, for effects that follow the temperature.
 _WARMING = 3.0
@@ -69,7 +60,7 @@ class Signature:
     voltage: FloatArray
     base: FloatArray
     changed: FloatArray
-    telling: View
+    telling: views.View
     coordinate: FloatArray
     counted: FloatArray
 
@@ -149,8 +140,7 @@ def standard_voltage(period: float, span: float) -> tuple[FloatArray, FloatArray
 
 
 def _raised(way: FloatArray) -> FloatArray:
-    risen: FloatArray = 0.5 * (1.0 - np.cos(np.pi * way))
-    return risen
+    return 0.5 * (1.0 - np.cos(np.pi * way))
 
 
 def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
@@ -175,7 +165,7 @@ def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
             yield _Play(size, time, voltage, fitted, y, warming)
 
 
-def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArray]:
+def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, FloatArray]:
     """Return the view that says most of the difference, its coordinate, and what it counts."""
     d = play.changed - play.base
     if SPECTRAL_PEAKS in effect.probe.values():
@@ -183,23 +173,23 @@ def _telling(effect: Component, play: _Play) -> tuple[View, FloatArray, FloatArr
     record = Record(
         name="signature", time=play.time, voltage=play.voltage, displacement=play.changed
     )
-    rows = [time_axis(record), *axes(record, play.base, drive_of(record))]
+    rows = [views.time_axis(record), *views.axes(record, play.base, views.drive_of(record))]
     # two amplitudes at two rates make no curve
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
-        rows = [Axis("temperature", "K", play.warming)]
-    items = [_view(axis, d) for axis in rows]
+        rows = [views.Axis("temperature", "K", play.warming)]
+    signatures = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
-        axis, _ = hold_axis(record)
-        items.append(_view(axis, _since_it_began(axis.x, d)))
+        axis, _ = views.hold_axis(record)
+        signatures.append(_view(axis, _since_it_began(axis.x, d)))
 
-    def told(row: tuple[View, FloatArray, FloatArray]) -> float:
+    def weight(row: tuple[views.View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
-    return max(items, key=told)
+    return max(signatures, key=weight)
 
 
-def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
+def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, FloatArray]:
     """Return the binned means of a difference along an axis, with the share they explain.
 
     No part is left out for judging, as in a measured record: this one has no noise but 2 %, and no
@@ -208,18 +198,18 @@ def _view(axis: Axis, d: FloatArray) -> tuple[View, FloatArray, FloatArray]:
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    observed = view(ground_of(residual, noise), axis)
+    seen = views.view(views.ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
-    if not observed.x.size:
-        return observed, coordinate, counted
-    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], observed.x))
-    left = counted[on] - np.interp(x, bins, observed.mean)
+    if not seen.x.size:
+        return seen, coordinate, counted
+    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], seen.x))
+    left = counted[on] - np.interp(x, bins, seen.mean)
     power = float(np.sum(d[there] ** 2))
     others = float(np.sum(d[there & ~on] ** 2))
     share = 1.0 - (float(np.sum(left**2)) + others) / power if power > 0 else 0.0
-    return replace(observed, share=max(0.0, share)), coordinate, counted
+    return replace(seen, share=max(0.0, share)), coordinate, counted
 
 
 def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
@@ -233,7 +223,7 @@ def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
     return moved
 
 
-def _spectrum(time: FloatArray, d: FloatArray) -> View:
+def _spectrum(time: FloatArray, d: FloatArray) -> views.View:
     """Return the amplitude density; its share is that of the band around the highest peak."""
     step = float(time[-1]) / (time.size - 1)
     window = np.hanning(d.size)
@@ -242,14 +232,7 @@ def _spectrum(time: FloatArray, d: FloatArray) -> View:
     peak = float(frequency[np.argmax(power)])
     band = np.abs(frequency - peak) <= max(_BAND * peak, 2.0 * frequency[1])
     share = float(np.sum(power[band]) / np.sum(power))
-    displayed = (frequency > 0) & (frequency < 20.0 * peak)
-    density: FloatArray = np.sqrt(2.0 * step * power / float(window @ window))
-    return View(
-        "spectrum",
-        "Hz",
-        frequency[displayed],
-        density[displayed],
-        np.zeros(int(displayed.sum())),
-        share,
-        True,
-    )
+    drawn = (frequency > 0) & (frequency < 20.0 * peak)
+    density = np.sqrt(2.0 * step * power / float(window @ window))[drawn]
+    none = np.zeros(density.size)
+    return views.View("spectrum", "Hz", frequency[drawn], density, none, share, True)

@@ -12,24 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from psa_casadi.component import Component
+from psa_casadi.diagnosis import held_out
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
-from psa_casadi.diagnosis.corrections import Correction, corrections
-from psa_casadi.diagnosis.held_out import (
-    Share,
-    StackBudget,
-    errors_of,
-    gain_of,
-    held_out_parts,
-    jackknife,
-    lost_elsewhere,
-    stack_budget,
-    whole_residuals,
-)
-from psa_casadi.diagnosis.judgement import Judge, told_from
+from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
+from psa_casadi.diagnosis.judgement import Judge, indistinguishable
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.patch import with_patch
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
     Alternative,
@@ -73,7 +62,7 @@ def blind_spots(
     spots = []
     present = {c.name for c in final.fit.model.components}
     present |= {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
-    present |= {n for s in steps for n in told_from(s, limits)}
+    present |= {n for s in steps for n in indistinguishable(s, limits)}
     factor = np.sqrt(final.screening.threshold)
     for effect in [e for e in table if e.name not in present]:
         scores = [s for s in final.screening.scores if s.direction.effect is effect]
@@ -98,20 +87,20 @@ _HOLD, _RATES, _SIZES = 3.0, 2, 3
 def next_experiment(
     causes: Sequence[Cause],
     verdict: Verdict,
-    texts: Sequence[Sequence[str]],
+    groups: Sequence[Sequence[str]],
     records: Sequence[Record],
     *,
     doubted: bool,
 ) -> NextExperiment:
-    """Return what to do next; `texts` are groups of effects that only a resonance tells apart."""
+    """Return what to do next; `groups` are effects that only a resonance tells apart."""
     if verdict == "not_driven":
         return NextExperiment(None, (), (note("correct_columns"),))
     if doubted:
         return NextExperiment(None, (), (note("record_again"),))
     open_ones = [(c.effect, *c.cannot_be_told_from) for c in causes if c.cannot_be_told_from]
-    rivals = tuple(dict.fromkeys(n for item in open_ones for n in item))
-    same = [item for item in open_ones if any(set(item) <= set(group) for group in texts)]
-    steps = [note("same_curve", effects=item) for item in same]
+    rivals = tuple(dict.fromkeys(n for effects in open_ones for n in effects))
+    same = [effects for effects in open_ones if any(set(effects) <= set(g) for g in groups)]
+    steps = [note("same_curve", effects=effects) for effects in same]
     if verdict in ("unexplained", "partly_explained") or len(same) < len(open_ones):
         steps.append(useful_records(records))
     if steps:
@@ -150,11 +139,11 @@ def alternatives(
     items = []
     for step in named:
         for name in sorted(
-            told_from(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
+            indistinguishable(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
         ):
             if name not in effects or effects[name].in_plant == step.cause.in_plant:
                 continue
-            fitted = _fitted(step, name, experiments)
+            fitted = _fitted(step, name)
             if fitted is None:
                 continue
             try:
@@ -169,13 +158,13 @@ def alternatives(
     return tuple(items)
 
 
-def _fitted(step: Step, name: str, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def _fitted(step: Step, name: str) -> Hypothesis | None:
     """Return the hypothesis with another effect in a cause's place, fitted to its end."""
     known = step.instead.get(name)
-    if known is None and step.beside is not None:
-        starts = step.beside.starts_of(name)
-        known = with_cause(step.beside.of, experiments, starts) if starts else None
-    return known if known is None or known.final else to_end(known, experiments)
+    if known is None and step.view_without is not None:
+        starts = step.view_without.starts_of(name)
+        known = with_cause(step.view_without.of, starts) if starts else None
+    return known if known is None or known.final else to_end(known)
 
 
 def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
@@ -202,7 +191,7 @@ def diagnosed_model(
     experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     stiffness_given: bool,
-    spent: StackBudget | None = None,
+    spent: held_out.StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
     result = determinacy(fit, experiments)
@@ -226,16 +215,16 @@ def diagnosed_model(
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:
     """Return the held-out error with the jackknife interval of its logarithm over the parts."""
-    sums, counts = held_out_parts(experiments, predicted)
+    sums, counts = held_out.held_out_parts(experiments, predicted)
     if not len(counts):
         return None
-    errors = errors_of(experiments, predicted)
+    errors = held_out.errors_of(experiments, predicted)
 
     def of(kept: BoolArray) -> float:
         power = float(np.sum(sums[kept])) / max(int(np.sum(counts[kept])), 1)
         return 0.5 * float(np.log(max(power, 1e-300)))
 
-    centre, half = jackknife(of, len(counts))
+    centre, half = held_out.jackknife(of, len(counts))
     records = sum(bool(e.held_out.any()) for e in experiments)
     return HeldOut(
         rms_m=errors.holdout_rms_m,
@@ -246,7 +235,7 @@ def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
     )
 
 
-def _share(s: Share) -> ErrorShare:
+def _share(s: held_out.Share) -> ErrorShare:
     return ErrorShare(s.what, s.share, Interval(*s.interval))
 
 
@@ -259,7 +248,7 @@ class StackJudge(Judge):
         super().__init__(steps, task, driven=driven)
         self.scale_given = scale_given
         self.errors, self.missed_errors = (
-            whole_residuals(self.experiments, s.predicted) for s in (self.last, self.first)
+            held_out.whole_residuals(self.experiments, s.predicted) for s in (self.last, self.first)
         )
         self.floors = noise_floor([e.record for e in self.experiments], self.errors)
         self.floor = pooled_level(self.floors, self.errors, self.last.screening.colour)
@@ -273,12 +262,12 @@ class StackJudge(Judge):
     def doubt(self) -> Note | None:
         """Why the records do not confirm the causes."""
         experiments, both = self.experiments, (self.first.predicted, self.last.predicted)
-        whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.holdout_rms, 1e-300))
+        whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.held[0], 1e-300))
         return unconfirmed(
             experiments,
-            gain_of(experiments, *both),
+            held_out.gain_of(experiments, *both),
             whole=whole,
-            lost=lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
+            lost=held_out.lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
             partly=self.last.test.alarm and len(self.steps) > 1,
             hidden=self.task.hidden,
             limits=self.limits,
@@ -293,19 +282,19 @@ class StackJudge(Judge):
         )
 
     @cached_property
-    def spent(self) -> StackBudget:
+    def spent(self) -> held_out.StackBudget:
         """The error budget in lengths."""
         both = self.first.predicted, self.final.predicted
-        return stack_budget(self.budget, self.experiments, *both, self.floor)
+        return held_out.stack_budget(self.budget, self.experiments, *both, self.floor)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Return the corrections beside a hypothesis, by columns at the stack's ports."""
         return corrections(of.fit, self.experiments, self.last.screening.colour)
 
-    def unseen(self, step: Step) -> tuple[Note, float] | None:
+    def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
         excess = held_out_excess(
-            step.fit, self.experiments, step.predicted, step.view.of.own[0], self.floors,
+            step.fit, self.experiments, step.predicted, step.view.of.colours[0], self.floors,
             self.limits,
         )  # fmt: skip
         return (note("held_out_error", factor=excess.factor), excess.p_value) if excess else None
@@ -323,9 +312,9 @@ class StackJudge(Judge):
         both = self.first.predicted, final.predicted
         misfits = _misfits(experiments, self.missed_errors, self.floors)
         records = [e.record for e in experiments]
-        texts = same_curves(experiments, self.task.table, self.first.fit)
+        groups = same_curves(experiments, self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
-        base, extended = (errors_of(experiments, p) for p in both)
+        base, extended = (held_out.errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
         output_error = OutputError("displacement", records[0].displacement_unit, self.floor, *rms)
         held = (s.view.of.held[1:] for s in (self.first, final))
@@ -340,19 +329,19 @@ class StackJudge(Judge):
             noise_floor_rms_m=self.floor,
             base_errors=base,
             extended_errors=extended,
-            gain=gain_of(experiments, *both),
+            gain=held_out.gain_of(experiments, *both),
             blind_to=blind_spots(self.steps, final, self.task.table, limits),
             next_experiment=next_experiment(
-                self.causes, self.verdict, texts, records, doubted=self.doubt is not None
+                self.causes, self.verdict, groups, records, doubted=self.doubt is not None
             ),
-            remarks=(*self.model.provenance.notes, *self.said, *coverage_notes(experiments)),
+            remarks=(*self.model.provenance.notes, *self.remarks, *coverage_notes(experiments)),
             experiments=tuple(experiments),
             base=both[0],
             extended=both[1],
             noise=self.floors,
             misfit=misfits,
             remainder=_misfits(experiments, self.errors, self.floors) if self.kept else misfits,
-            contenders=contenders(self.first, experiments, limits) if ambiguous else (),
+            contenders=contenders(self.first, limits) if ambiguous else (),
             alternatives=alternatives(
                 self.kept, final.fit, self.task, stiffness_given=self.scale_given
             ),

@@ -143,8 +143,7 @@ def _table(
 def _rounded(x: FloatArray) -> FloatArray:
     """Return the coordinate without rounding errors, which would make bins of one value."""
     step = 1e-6 * float(np.ptp(x))
-    rounded: FloatArray = np.round(x / step) * step if step > 0 else x
-    return rounded
+    return np.round(x / step) * step if step > 0 else x
 
 
 def _edges(x: FloatArray, log: bool) -> FloatArray:

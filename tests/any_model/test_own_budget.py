@@ -84,8 +84,8 @@ def test_intervals_cover_the_known_shares(records: int) -> None:
 
 
 def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
-    assert Share("worse", -0.2, (-0.5, 0.1)).shown == (0.0, 0.0, 0.1)
-    assert Share("all", 1.01, (0.9, 1.2)).shown == (1.0, 0.9, 1.0)
+    assert Share("worse", -0.2, (-0.5, 0.1)).clipped == (0.0, 0.0, 0.1)
+    assert Share("all", 1.01, (0.9, 1.2)).clipped == (1.0, 0.9, 1.0)
     assert Share("half", 0.5, (0.4, 0.62)).text == "50 % (40 to 62 %)"
     assert Share("all", 0.9995, (0.9992, 0.9999)).text == "99.95 % (99.92 to 99.99 %)"
     assert Share("most", 0.996, (0.98, 1.01)).text == "99.6 % (98.0 to 100.0 %)"

@@ -7,9 +7,8 @@ import pytest
 
 from psa_casadi.components import BASE
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.diagnosis.corrections import Patch, best_of, corrections
+from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
 from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
-from psa_casadi.diagnosis.patch import with_patch
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import compose

@@ -33,7 +33,7 @@ TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
 
 
 @pytest.fixture(scope="module")
-def shown() -> FloatArray:
+def displacement() -> FloatArray:
     """What a stack does, with a little noise."""
     result = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
     return result + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
@@ -59,8 +59,8 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
     assert "does not follow the voltage" in story(result)
 
 
-def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
-    result = _told(-shown)
+def test_a_flipped_sign_is_told_with_figures(displacement: FloatArray) -> None:
+    result = _told(-displacement)
     assert result.verdict == "not_driven"
     assert (
         "the sign of the displacement flipped the base model explains 100.00 %" in result.notes[-1]
@@ -69,8 +69,8 @@ def test_a_flipped_sign_is_told_with_figures(shown: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
-def test_a_displacement_in_another_unit_is_told(factor: float, shown: FloatArray) -> None:
-    result = _told(factor * shown)
+def test_a_displacement_in_another_unit_is_told(factor: float, displacement: FloatArray) -> None:
+    result = _told(factor * displacement)
     assert result.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
 
@@ -105,23 +105,25 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
     assert not any("of the same device" in n for n in result.notes)
 
 
-def test_what_no_fit_can_start_from_is_refused_in_words(shown: FloatArray) -> None:
+def test_what_no_fit_can_start_from_is_refused_in_words(displacement: FloatArray) -> None:
     rest = np.ones(TIME.size)
     with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
-        _told(1e6 * shown)
+        _told(1e6 * displacement)
     with pytest.raises(InputError, match="The voltage is 40 V throughout"):
-        _told(shown, 40.0 * rest)
+        _told(displacement, 40.0 * rest)
     with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
         _told(1e-6 * rest)
     with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
-        _told(np.where(shown > np.mean(shown), 1e-5, 0.0))
+        _told(np.where(displacement > np.mean(displacement), 1e-5, 0.0))
 
 
 @slow
-def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArray) -> None:
-    moves = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=shown)
+def test_a_record_at_rest_beside_others_counts_over_their_range(displacement: FloatArray) -> None:
+    moves = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=displacement)
     rest = np.ones(TIME.size)
-    hold = replace(moves, name="hold", voltage=VOLTAGE[0] * rest, displacement=shown[0] * rest)
+    hold = replace(
+        moves, name="hold", voltage=VOLTAGE[0] * rest, displacement=displacement[0] * rest
+    )
     result = psa.diagnose([moves, hold], effects=TABLE)
     assert np.isfinite(result.base_errors.holdout_nrmse_percent)
 
@@ -130,9 +132,9 @@ def test_a_record_at_rest_beside_others_counts_over_their_range(shown: FloatArra
 NEAR = ("sensor_nonlinearity", "load_stiffness", "preload_loss", "hysteresis_memory", "slow_creep")
 
 
-def _curved(shown: FloatArray) -> FloatArray:
+def _curved(displacement: FloatArray) -> FloatArray:
     """A reading with a ripple that narrows over the travel, which no effect of the table forms."""
-    return shown + 1e-7 * np.sin(0.25 * (shown / 1e-6) ** 2)
+    return displacement + 1e-7 * np.sin(0.25 * (displacement / 1e-6) ** 2)
 
 
 @slow

@@ -7,7 +7,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.diagnosis.corrections import KINDS, Patch
-from psa_casadi.diagnosis.families import Shown, families, place_and_kind
+from psa_casadi.diagnosis.families import CauseEvidence, families, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.effects import EFFECTS
 from psa_casadi.report.words.verdict_words import family_sentence
@@ -36,7 +36,7 @@ def test_every_effect_and_every_unnamed_correction_has_a_family() -> None:
 
 def test_effects_of_one_place_and_kind_are_one_family() -> None:
     chances = {"slow_creep": 0.6, "charge_leakage": 0.3, "offset_drift": 0.1}
-    creep, leak, drift = families(chances, PLACES, Shown(1e15, FEW), [], LIMITS)
+    creep, leak, drift = families(chances, PLACES, CauseEvidence(1e15, FEW), [], LIMITS)
     assert (creep.place, creep.kind) == CREEP
     assert [f.probability for f in (creep, leak, drift)] == pytest.approx([0.6, 0.3, 0.1])
     assert not any(f.not_listed for f in (creep, leak, drift))
@@ -50,11 +50,11 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
     same = _patch("relaxation", "force", 1100.0)
     other = _patch("curve", "drive voltage", 1080.0)
     weak = _patch("time", "reading", 5.0)
-    displayed = Shown(1000.0, FEW)
+    displayed = CauseEvidence(1000.0, FEW)
     result = families({"slow_creep": 1.0}, PLACES, displayed, [same, other, weak], LIMITS)
     shares = {(f.place, f.kind): (f.probability, f.not_listed) for f in result}
     odds = float(np.exp(-1.0))
-    tried = displayed.known(LIMITS)
+    tried = displayed.listed_probability(LIMITS)
     assert shares[CREEP] == pytest.approx((tried / (1.0 + odds), 0.0), abs=1e-4)
     assert shares["drive", "curve"] == pytest.approx((tried * odds / (1.0 + odds),) * 2, rel=1e-4)
     assert len(shares) == 2
@@ -63,34 +63,37 @@ def test_a_correction_of_another_kind_takes_its_share_and_one_of_the_same_kind_n
 def test_one_of_its_kind_that_explains_much_more_leaves_the_form_open() -> None:
     """It has more freedom: with 1000 nats it is as likely as a listed effect with 700."""
     free = _patch("relaxation", "force", 1000.0)
-    (creep,) = families({"slow_creep": 1.0}, PLACES, Shown(700.0, FEW), [free], LIMITS)
+    (creep,) = families({"slow_creep": 1.0}, PLACES, CauseEvidence(700.0, FEW), [free], LIMITS)
     assert creep.not_listed == pytest.approx(creep.effects["slow_creep"])
-    (creep,) = families({"slow_creep": 1.0}, PLACES, Shown(300.0, FEW), [free], LIMITS)
+    (creep,) = families({"slow_creep": 1.0}, PLACES, CauseEvidence(300.0, FEW), [free], LIMITS)
     assert creep.not_listed > 0.99 * creep.probability
 
 
 def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
     """A quarter less evidence are odds of exp(1/2): without the cause they tell little of it."""
     rows = [_patch("memory", "force", 400.0), _patch("curve", "reading", 300.0)]
-    displayed = Shown(400.0, FEW)
+    displayed = CauseEvidence(400.0, FEW)
     first, second = families({}, {}, displayed, rows, LIMITS)
     assert (first.place, first.kind) == ("plant", "hysteresis")
     assert (second.place, second.kind) == ("sensor", "curve")
     assert first.not_listed / second.not_listed == pytest.approx(np.exp(0.5))
-    assert first.not_listed + second.not_listed == pytest.approx(displayed.known(LIMITS))
+    assert first.not_listed + second.not_listed == pytest.approx(
+        displayed.listed_probability(LIMITS)
+    )
 
 
 def test_the_smaller_a_cause_the_likelier_it_is_something_that_nobody_has_thought_of() -> None:
     """At four times the evidence of the same samples the odds of that are half; of two, twice."""
     small, large, two = (
-        1.0 / Shown(e, 4000, k).known(LIMITS) - 1.0 for e, k in ((100.0, 1), (400.0, 1), (400.0, 2))
+        1.0 / CauseEvidence(e, 4000, k).listed_probability(LIMITS) - 1.0
+        for e, k in ((100.0, 1), (400.0, 1), (400.0, 2))
     )
     assert small / large == pytest.approx(2.0)
     assert two / large == pytest.approx(2.0)
 
 
 def test_the_sentence_names_what_no_effect_is_and_what_was_not_tried() -> None:
-    chances, weak = {"slow_creep": 1.0}, Shown(100.0, 4000)
+    chances, weak = {"slow_creep": 1.0}, CauseEvidence(100.0, 4000)
     rival = _patch("curve", "reading", 98.0)
     text = family_sentence(families(chances, PLACES, weak, [rival], LIMITS))
     assert "a relaxation in the stack" in text

@@ -32,7 +32,7 @@ def noise(samples: int, correlation: float, seed: int) -> FloatArray:
     return NOISE * coloured
 
 
-def seen(
+def misfit_of(
     voltage: FloatArray, error: FloatArray, *, correlation: float = 0.0, seed: int = 0
 ) -> Misfit:
     residual = error + noise(voltage.size, correlation, seed)
@@ -50,7 +50,7 @@ def shares(m: Misfit) -> dict[str, float]:
 
 def test_a_function_of_the_voltage() -> None:
     error = 3e-8 * np.sin(2 * np.pi * SINE / 100.0)
-    m = seen(SINE, error)
+    m = misfit_of(SINE, error)
     result = shares(m)
     assert result["voltage"] > 0.97
     assert max(result[name] for name in ("time", "rate", "amplitude", "frequency")) == 0.0
@@ -69,20 +69,20 @@ def test_creep_after_every_step() -> None:
     for k in range(1, 8):
         since = np.arange(TIME.size - 2_500 * k)
         error[2_500 * k :] += np.sign(LEVELS[k] - LEVELS[k - 1]) * np.log10(1.0 + since / 10.0)
-    m = seen(STEPS, slope * error)
+    m = misfit_of(STEPS, slope * error)
     assert m.holds is not None
     assert m.slope is not None
     assert m.holds.share > 0.4
     assert m.slope.value == pytest.approx(slope, rel=0.2)
     assert m.slope.value > 10.0 * m.slope.error
     assert any(s.startswith("In 7 holds the residual moves by +") for s in m.sentences)
-    assert seen(SINE, 0.0 * SINE).holds is None
+    assert misfit_of(SINE, 0.0 * SINE).holds is None
 
 
 def test_the_error_after_a_reversal() -> None:
     triangle = excitation.triangle(TIME, 0.0, 100.0, 1.0)
     since = np.mod(TIME, 0.5)
-    m = seen(triangle, 5e-8 * np.exp(-since / 0.02))
+    m = misfit_of(triangle, 5e-8 * np.exp(-since / 0.02))
     result = shares(m)
     assert result["since_reversal"] > 0.9
     assert result["since_reversal"] == max(result.values())
@@ -97,8 +97,8 @@ AMPLITUDE = np.repeat([30.0, 60.0, 100.0], 12_000)
 
 def test_amplitude_and_frequency_of_the_drive() -> None:
     frequency = np.tile(np.repeat([1.0, 2.0, 5.0], 4_000), 3)
-    by_amplitude = shares(seen(SINES, 5e-10 * AMPLITUDE))
-    by_frequency = shares(seen(SINES, 1e-8 * frequency))
+    by_amplitude = shares(misfit_of(SINES, 5e-10 * AMPLITUDE))
+    by_frequency = shares(misfit_of(SINES, 1e-8 * frequency))
     assert by_amplitude["amplitude"] > 0.9
     assert by_amplitude["frequency"] < 0.1
     assert by_frequency["frequency"] > 0.9
@@ -106,21 +106,21 @@ def test_amplitude_and_frequency_of_the_drive() -> None:
 
 
 def test_delay_grows_with_frequency_and_gain_with_amplitude() -> None:
-    delayed = seen(SINES, -4e-11 * np.gradient(SINES, STEP))
+    delayed = misfit_of(SINES, -4e-11 * np.gradient(SINES, STEP))
     result = shares(delayed)
     assert result["frequency_lag"] > 0.3
     assert result["frequency_gain"] == result["frequency"] == 0.0
     view = next(w for w in delayed.views if w.name == "frequency_lag")
     assert np.all(np.diff(view.mean[[0, -1]]) < -5e-9)
     grown = 1e-9 * (SINES - 0.5 * AMPLITUDE) * (AMPLITUDE - 60.0)
-    stronger = shares(seen(SINES, grown))
+    stronger = shares(misfit_of(SINES, grown))
     assert stronger["amplitude_gain"] > 0.3
     assert stronger["amplitude_lag"] == stronger["amplitude"] == 0.0
 
 
 def test_a_drift_does_not_hide_a_smaller_error() -> None:
     drift = 2e-7 * (TIME / TIME[-1]) ** 2
-    m = seen(SINE, drift + 1e-8 * np.sin(2 * np.pi * SINE / 100.0))
+    m = misfit_of(SINE, drift + 1e-8 * np.sin(2 * np.pi * SINE / 100.0))
     view = next(w for w in m.views if w.name == "voltage")
     assert shares(m)["time"] > 0.9
     assert view.significant
@@ -130,7 +130,7 @@ def test_a_drift_does_not_hide_a_smaller_error() -> None:
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("voltage", [SINE, MULTISINE, STEPS], ids=["sine", "multisine", "steps"])
 def test_white_noise_shows_nothing(voltage: FloatArray, seed: int) -> None:
-    m = seen(voltage, 0.0 * voltage, seed=seed)
+    m = misfit_of(voltage, 0.0 * voltage, seed=seed)
     assert len(m.sentences) == 1
     assert max(shares(m).values()) < 0.02
     assert m.spectrum.share < 0.02
@@ -140,7 +140,7 @@ def test_coloured_noise_says_something_false_in_one_of_forty_records_at_most() -
     output = 0
     for seed in range(40):
         voltage = (SINE, MULTISINE, STEPS)[seed % 3][:8_000]
-        output += len(seen(voltage, 0.0 * voltage, correlation=0.7, seed=seed).sentences) > 1
+        output += len(misfit_of(voltage, 0.0 * voltage, correlation=0.7, seed=seed).sentences) > 1
     assert output <= 1
 
 
@@ -148,7 +148,7 @@ def test_coloured_noise_says_something_false_in_one_of_forty_records_at_most() -
 def test_standard_errors_know_of_correlation(correlation: float) -> None:
     squares = []
     for seed in range(6):
-        m = seen(MULTISINE, 0.0 * TIME, correlation=correlation, seed=seed)
+        m = misfit_of(MULTISINE, 0.0 * TIME, correlation=correlation, seed=seed)
         view = next(v for v in m.views if v.name == "time")
         squares.append(np.mean((view.mean / view.spread) ** 2))
     assert np.mean(squares) == pytest.approx(1.0, abs=0.35)
@@ -188,7 +188,7 @@ def test_counts_stay_counts() -> None:
 
 @pytest.mark.parametrize("voltage", [SINE, MULTISINE], ids=["sine", "multisine"])
 def test_a_line_at_57_9_hz(voltage: FloatArray) -> None:
-    m = seen(voltage, 2e-8 * np.sin(2 * np.pi * 57.9 * TIME))
+    m = misfit_of(voltage, 2e-8 * np.sin(2 * np.pi * 57.9 * TIME))
     assert m.sentences[1].startswith("The residual has a line whatever the drive does: 57.9 Hz")
     assert len(m.sentences) == 2
     (line,) = m.spectrum.lines
@@ -200,7 +200,7 @@ def test_a_line_at_57_9_hz(voltage: FloatArray) -> None:
 def test_the_mains_and_the_drive_are_named() -> None:
     f = 1.0 / 0.45
     error = 2e-8 * np.sin(2 * np.pi * 50.0 * TIME) + 1e-8 * np.sin(6 * np.pi * f * TIME)
-    mains, harmonic = seen(excitation.sine(TIME, 0.0, 100.0, f), error).spectrum.lines
+    mains, harmonic = misfit_of(excitation.sine(TIME, 0.0, 100.0, f), error).spectrum.lines
     assert (mains.name, mains.of_drive) == ("50 Hz mains", False)
     assert (harmonic.name, harmonic.of_drive) == ("harmonic 3 of the drive", True)
     slow = grid(4_000, 1.0 / 45.0)
@@ -213,7 +213,7 @@ def test_the_mains_and_the_drive_are_named() -> None:
 
 def test_the_spectrum_of_noise_lies_on_its_floor() -> None:
     for correlation in (0.0, 0.7):
-        spectrum = seen(SINE, 0.0 * SINE, correlation=correlation).spectrum
+        spectrum = misfit_of(SINE, 0.0 * SINE, correlation=correlation).spectrum
         ratio = spectrum.density[-100:] / spectrum.floor[-100:]
         assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.1)
         assert np.all(np.diff(spectrum.frequency) > 0)
@@ -222,7 +222,7 @@ def test_the_spectrum_of_noise_lies_on_its_floor() -> None:
 def test_even_and_odd_nonlinearity_of_a_sine() -> None:
     w = 4 * np.pi * TIME
     error: FloatArray = 1.5e-8 * np.sin(w) + 2e-8 * np.cos(2 * w) + 1e-8 * np.sin(3 * w + 0.4)
-    result = seen(SINE, error)
+    result = misfit_of(SINE, error)
     split = result.split
     assert split is not None
     assert split.fundamental == pytest.approx(2.0, rel=1e-6)
@@ -239,9 +239,9 @@ def test_a_multisine_of_odd_lines_shows_its_nonlinearity_between_them() -> None:
     w = 2 * np.pi * TIME[:2_000] / 2.0
     odd = [k for k in range(1, 40, 2) if k % 8 != 5]
     u: FloatArray = np.tile(sum(np.cos(k * w + rng.uniform(0, 6.28)) for k in odd), 10) / 4.0
-    linear = seen(u, 3e-8 * u).split
-    even = seen(u, 3e-8 * (u**2 - np.mean(u**2))).split
-    cubic = seen(u, 3e-8 * u**3).split
+    linear = misfit_of(u, 3e-8 * u).split
+    even = misfit_of(u, 3e-8 * (u**2 - np.mean(u**2))).split
+    cubic = misfit_of(u, 3e-8 * u**3).split
     assert linear is not None
     assert even is not None
     assert cubic is not None
@@ -251,4 +251,4 @@ def test_a_multisine_of_odd_lines_shows_its_nonlinearity_between_them() -> None:
     assert even.even == pytest.approx(9e-16 * np.var(u**2), rel=0.02)
     assert cubic.even == 0.0
     assert cubic.odd > 100.0 * NOISE**2 / 1e3
-    assert seen(MULTISINE, 0.0 * TIME).split is None
+    assert misfit_of(MULTISINE, 0.0 * TIME).split is None

@@ -69,7 +69,7 @@ def _size_test(
         colour,
         1.0,
         lengths=lengths,
-        knowable=0.0,
+        detection_limit=0.0,
         own=own,
         alarms_below=1e-3,
     ).p_value

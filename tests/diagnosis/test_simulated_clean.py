@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.noise import knowable, known_colour, noise_floor
+from psa_casadi.diagnosis.noise import detection_limit, known_colour, noise_floor
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.records import multisine, sine, triangle
 from psa_casadi.records.noise import last_place_of
@@ -106,8 +106,8 @@ def test_what_can_be_known_holds_rounding_error_and_form() -> None:
     rest = float(np.hypot(error, LIMITS.form_of_range * whole))
     signs = np.where(np.arange(record.n) % 2, 1.0, -1.0)
     small, large = rounding * signs, 2.0 * rounding * signs
-    assert knowable(record, error, small) == pytest.approx(float(np.hypot(rest, rounding)))
-    assert knowable(record, error, large) == pytest.approx(rest)  # noise has made it white
+    assert detection_limit(record, error, small) == pytest.approx(float(np.hypot(rest, rounding)))
+    assert detection_limit(record, error, large) == pytest.approx(rest)  # noise has made it white
 
 
 def test_what_a_first_loop_leaves_behind_is_no_noise() -> None:

@@ -16,6 +16,7 @@ from psa_casadi.component import (
 from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, parameter_ports, ports_of, with_ports
+from psa_casadi.shapes import ANGLES
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter, State
 
@@ -64,9 +65,9 @@ def at_port(
     name: str,
     law: Law,
     *,
-    gain: str,
     words: tuple[str, str, str, str],
     parameters: tuple[Parameter, ...],
+    gain: str = "size",
     states: tuple[State, ...] = (),
     probe: Mapping[str, tuple[float, ...]] | None = None,
     finite_step: tuple[float, ...] = (),
@@ -76,9 +77,9 @@ def at_port(
 ) -> Attached:
     """Return an effect that adds a term to a port's sum.
 
-    Parameters and states have short names here, before which the effect's stands in the model.
-    `words` are description, source, equation and what it looks like; in the equation, Q stands for
-    the port's sum and q for the `signal`.
+    Parameters and states have short names here, before which the effect's stands in the model. A
+    parameter `angle` is tried at `ANGLES`. `words` are description, source, equation and what it
+    looks like; in the equation, Q stands for the port's sum and q for the `signal`.
     """
 
     def equations(s: Symbols) -> Equations:
@@ -91,6 +92,7 @@ def at_port(
 
     description, source, text, looks = words
     what = _KIND.split(name)[0]
+    angles = {p.name: ANGLES for p in parameters if p.name == "angle"}
     component = Component(
         name=name,
         description=f"{port.words}: {description}",
@@ -99,7 +101,7 @@ def at_port(
         parameters=tuple(replace(p, name=f"{name}_{p.name}") for p in parameters),
         states=tuple(replace(q, name=f"{name}_{q.name}") for q in states),
         gain=f"{name}_{gain}",
-        probe={f"{name}_{short}": grid for short, grid in (probe or {}).items()},
+        probe={f"{name}_{short}": grid for short, grid in (probe or angles).items()},
         finite_step=finite_step,
         equation_text=text.replace("Q", port.balance).replace("q", signal),
         looks_like=looks,

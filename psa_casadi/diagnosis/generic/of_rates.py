@@ -1,4 +1,9 @@
-"""Effects in the rate of a state or an intermediate, and the table of all effects of a model."""
+"""Effects in the rate of a state or an intermediate, and the table of all effects of a model.
+
+Parameters, and gains of intermediates, may change with a state, an input or time.
+"""
+
+from dataclasses import dataclass, replace
 
 import casadi as ca
 
@@ -15,19 +20,10 @@ from psa_casadi.diagnosis.generic.attached import (
     size_at,
     size_of,
 )
-from psa_casadi.diagnosis.generic.of_parameters import changing
 from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
+from psa_casadi.model import ports
 from psa_casadi.model.compose import Model
-from psa_casadi.model.ports import (
-    Port,
-    definition_of,
-    is_place,
-    kinematics,
-    ports_of,
-    seen_by,
-    unit_of,
-)
-from psa_casadi.shapes import ANGLES, magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.shapes import magnitude_power, signed_power, smooth_magnitude
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
@@ -39,84 +35,108 @@ _IN_FULL = (0.0, 2.0, -2.0)
 _STILL = 1e-3
 #: Stiffest stop, over the largest rate at one range beyond it; width of its corner over the range.
 _STIFF, _CORNER = 1e4, 0.005
+#: A parameter changes by this share of its value as a rule, and by so many times it at most.
+_CHANGES, _MOST = 0.1, 5.0
 
 
-def sum_effects(model: Model, port: Port, sizes: Sizes) -> tuple[Attached, ...]:
+@dataclass(frozen=True)
+class _Sum:
+    """The sum at a port of a model, with the sizes of its signals and rates."""
+
+    model: Model
+    port: ports.Port
+    sizes: Sizes
+
+    @property
+    def largest(self) -> float:
+        """The largest magnitude of what the port adds to."""
+        return size_at(self.port, self.sizes)
+
+    def size(self, what: str, *, positive: bool = False) -> Parameter:
+        """Return the parameter that removes an effect at 0."""
+        return size_of(self.port.unit, self.largest, what, positive=positive)
+
+    def range(self, x: str) -> Parameter:
+        """Return the scale of a signal."""
+        return scale_of("range", self.sizes.signals[x], self.unit(x), x)
+
+    def unit(self, x: str) -> str:
+        """Return the unit of a signal."""
+        return ports.unit_of(self.model, x)
+
+
+def sum_effects(model: Model, port: ports.Port, sizes: Sizes) -> tuple[Attached, ...]:
     """Return what may be missing in the rate of a state, or in an intermediate.
 
     Of an intermediate, what is no coordinate may be lost by; a rate is lost by its own state.
     """
-    item = [port.variable] if port.kind == "rate" else []
-    items = [n for n in seen_by(model, port) if n not in model.input_names]
-    ways = [n for n in items if n not in item and not _way(model, n)[1]]
-    losing = item or [n for n in items if n not in ways]
+    at = _Sum(model, port, sizes)
+    rate = [port.variable] if port.kind == "rate" else []
+    items = [n for n in ports.seen_by(model, port) if n not in model.input_names]
+    ways = [n for n in items if n not in rate and not _way(model, n)[1]]
+    losing = rate or [n for n in items if n not in ways]
     # a hysteresis works along coordinates, else along all that is seen
     return (
-        _constant(model, port, sizes),
-        *(make(model, port, sizes, n) for n in losing for make in (_loss, _friction, _drag)),
-        *(make(model, port, sizes, n) for n in items for make in (_curve, _stop)),
-        *(_hysteresis(model, port, sizes, n) for n in ways or items),
+        _constant(at),
+        *(make(at, n) for n in losing for make in (_loss, _friction, _drag)),
+        *(make(at, n) for n in items for make in (_curve, _stop)),
+        *(_hysteresis(at, n) for n in ways or items),
     )
 
 
-def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[Port, ...]]:
+def _way(model: Model, name: str) -> tuple[list[tuple[str, float]], tuple[ports.Port, ...]]:
     """Return how fast a state or a kinematic intermediate changes: a sum of symbols times numbers.
 
     And the rates among these. A coordinate has none: all are states.
     """
-    ports = {p.variable: p for p in ports_of(model) if p.kind == "rate"}
-    parts = kinematics(model).get(name, {name: 1.0})
-    speeds = {q: definition_of(model, q) for q in parts}
-    reads = tuple(ports[q] for q, speed in speeds.items() if speed is None)
-    return [(speeds[q] or ports[q].balance, factor) for q, factor in parts.items()], reads
+    rates = {p.variable: p for p in ports.ports_of(model) if p.kind == "rate"}
+    parts = ports.kinematics(model).get(name, {name: 1.0})
+    speeds = {q: ports.definition_of(model, q) for q in parts}
+    reads = tuple(rates[q] for q, speed in speeds.items() if speed is None)
+    return [(speeds[q] or rates[q].balance, factor) for q, factor in parts.items()], reads
 
 
-def _name(kind: str, port: Port, q: str) -> str:
-    item = port.kind == "rate" and q == port.variable
-    return f"{kind}_in_{q}" if item else f"{kind}_of_{q}_in_{port.variable}"
+def _name(kind: str, port: ports.Port, q: str) -> str:
+    itself = port.kind == "rate" and q == port.variable
+    return f"{kind}_in_{q}" if itself else f"{kind}_of_{q}_in_{port.variable}"
 
 
-def _constant(_: Model, port: Port, sizes: Sizes) -> Attached:
+def _constant(at: _Sum) -> Attached:
     return at_port(
-        port, f"constant_in_{port.variable}", lambda s, item: item("size"),
-        gain="size",
+        at.port, f"constant_in_{at.port.variable}", lambda s, item: item("size"),
         words=(
             "a constant is missing",
             "weight, leak, offset of an input",
             "Q gains size",
             "a residual of the form of a step answer in every record",
         ),
-        parameters=(size_of(port.unit, size_at(port, sizes), "constant part"),),
+        parameters=(at.size("constant part"),),
     )  # fmt: skip
 
 
-def _loss(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
+def _loss(at: _Sum, v: str) -> Attached:
     return at_port(
-        port, _name("loss", port, v), lambda s, item: -item("size") * getattr(s, v) / item("range"),
-        gain="size",
+        at.port, _name("loss", at.port, v),
+        lambda s, item: -item("size") * getattr(s, v) / item("range"),
         words=(
             f"it loses in proportion to {v}",
             "viscous damping, leak, cooling",
             f"Q loses size {v}/range",
             "resonances are lower, and decays faster, at every level alike",
         ),
-        parameters=(
-            size_of(port.unit, size_at(port, sizes), f"loss at the largest {v}"),
-            _range(model, sizes, v),
-        ),
+        parameters=(at.size(f"loss at the largest {v}"), at.range(v)),
     )  # fmt: skip
 
 
-def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
-    size = rounded(sizes.signals[v])
+def _friction(at: _Sum, v: str) -> Attached:
+    size = rounded(at.sizes.signals[v])
 
     def law(s: Symbols, item: Own) -> Expression:
         state = getattr(s, v)
         return -item("size") * state / ca.sqrt(state**2 + item("width") ** 2)
 
     return at_port(
-        port, _name("friction", port, v), law,
-        gain="size",
+        at.port, _name("friction", at.port, v), law,
         words=(
             "dry friction holds against the motion",
             "Coulomb's friction, smooth about rest",
@@ -124,11 +144,9 @@ def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
             "what stands still needs a push to move; small motions are missed most",
         ),
         parameters=(
-            size_of(
-                port.unit, size_at(port, sizes), "friction, as a rate", positive=port.kind == "rate"
-            ),
+            at.size("friction, as a rate", positive=at.port.kind == "rate"),
             Parameter(
-                "width", 0.02 * size, unit_of(model, v), (5e-4 * size, 0.7 * size),
+                "width", 0.02 * size, at.unit(v), (5e-4 * size, 0.7 * size),
                 f"{v} below which it fades", log=True, limit=True
             ),
         ),
@@ -136,57 +154,46 @@ def _friction(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
     )  # fmt: skip
 
 
-def _drag(model: Model, port: Port, sizes: Sizes, v: str) -> Attached:
+def _drag(at: _Sum, v: str) -> Attached:
     def law(s: Symbols, item: Own) -> Expression:
         part = getattr(s, v) / item("range")
         return -item("size") * part * smooth_magnitude(part, _STILL)
 
     return at_port(
-        port, _name("drag", port, v), law,
-        gain="size",
+        at.port, _name("drag", at.port, v), law,
         words=(
             f"it loses with the square of {v}",
             "drag of a turbulent flow",
             f"Q loses size r |r|,  r = {v}/range",
             "damping that grows with the level",
         ),
-        parameters=(
-            size_of(port.unit, size_at(port, sizes), f"loss at the largest {v}"),
-            _range(model, sizes, v),
-        ),
+        parameters=(at.size(f"loss at the largest {v}"), at.range(v)),
     )  # fmt: skip
 
 
-def _curve(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
+def _curve(at: _Sum, x: str) -> Attached:
     return at_port(
-        port, f"curve_of_{x}_in_{port.variable}",
+        at.port, f"curve_of_{x}_in_{at.port.variable}",
         lambda s, item: item("size") * bent(getattr(s, x) / item("range"), item("angle")),
-        gain="size",
         words=(
             f"it depends on {x} along a curve",
             "hardening or softening spring; first two terms beyond the straight line",
             f"Q gains size (cos(angle) r^2 + sin(angle) r^3),  r = {x}/range",
             "resonances move with the level; harmonics",
         ),
-        parameters=(
-            size_of(port.unit, size_at(port, sizes), "deviation from the line at the range's end"),
-            ANGLE,
-            _range(model, sizes, x),
-        ),
-        probe={"angle": ANGLES},
+        parameters=(at.size("deviation from the line at the range's end"), ANGLE, at.range(x)),
     )  # fmt: skip
 
 
-def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
-    force, size = size_at(port, sizes), rounded(sizes.signals[x])
+def _stop(at: _Sum, x: str) -> Attached:
+    force, size = at.largest, rounded(at.sizes.signals[x])
 
     def law(s: Symbols, item: Own) -> Expression:
         excess = beyond(getattr(s, x), item("level"), _CORNER * item("range"))
         return -item("size") * excess / item("range")
 
     return at_port(
-        port, f"stop_of_{x}_in_{port.variable}", law,
-        gain="size",
+        at.port, f"stop_of_{x}_in_{at.port.variable}", law,
         words=(
             f"a stop or an overflow holds {x} at a level",
             "contact with an elastic stop; softplus: Dugas et al., NIPS 13 (2000)",
@@ -195,22 +202,22 @@ def _stop(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         ),
         parameters=(
             Parameter(
-                "size", 0.0, port.unit, (0.0, _STIFF * force),
+                "size", 0.0, at.port.unit, (0.0, _STIFF * force),
                 "force of the stop, as a rate, at one range beyond it", scale=force,
             ),
-            level_of(0.8, (0.02, 2.0), size, unit_of(model, x)),
-            _range(model, sizes, x),
+            level_of(0.8, (0.02, 2.0), size, at.unit(x)),
+            at.range(x),
         ),
         probe={"level": tuple(share * size for share in (0.5, 0.7, 0.85, 0.95))},
     )  # fmt: skip
 
 
-def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
+def _hysteresis(at: _Sum, x: str) -> Attached:
     """Bouc and Wen's element along a state: z' = w (1 - bend |r|^n) - loss |w| sgn(r) |r|^n.
 
     w = x'/range and r = z, so that the loop's own way is one range where loss and bend are 1.
     """
-    (parts, reads), force = _way(model, x), size_at(port, sizes)
+    (parts, reads), force = _way(at.model, x), at.largest
 
     def law(s: Symbols, item: Own) -> Terms:
         rate = sum(factor * getattr(s, speed) for speed, factor in parts)
@@ -221,8 +228,7 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         return {"state": der}, -item("size") * z
 
     return at_port(
-        port, f"hysteresis_of_{x}_in_{port.variable}", law,
-        gain="size",
+        at.port, f"hysteresis_of_{x}_in_{at.port.variable}", law,
         words=(
             f"it depends on the way that {x} came",
             "Bouc and Wen's model of hysteresis (Wen, J. Eng. Mech. 102 (1976), 249)",
@@ -231,14 +237,14 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
         ),
         parameters=(
             Parameter(
-                "size", 0.0, port.unit, (-LARGEST * force, LARGEST * force),
+                "size", 0.0, at.port.unit, (-LARGEST * force, LARGEST * force),
                 "slope of the loop's part, as a rate", scale=3 * ORDINARY * force,
             ),
             Parameter("loss", 1.0, "1", (1e-3, 1e3), "how fast the loop turns", log=True),
             Parameter("bend", 0.0, "1", (-500.0, 500.0), "how the loop bends", scale=0.3),
             Parameter("n", 1.0, "1", (0.2, 8.0), "sharpness of the loop's turns", log=True),
-            _range(model, sizes, x),
-            scale_of("rate", sizes.rates[x], rate_unit(unit_of(model, x)), f"rate of {x}"),
+            at.range(x),
+            scale_of("rate", at.sizes.rates[x], rate_unit(at.unit(x)), f"rate of {x}"),
         ),
         states=(State("state", "1", "memory of the way", 0.5, memory=True, settles=False),),
         probe={"loss": (0.3, 1.0, 4.0, 16.0)},
@@ -247,16 +253,52 @@ def _hysteresis(model: Model, port: Port, sizes: Sizes, x: str) -> Attached:
     )  # fmt: skip
 
 
-def _range(model: Model, sizes: Sizes, x: str) -> Parameter:
-    return scale_of("range", sizes.signals[x], unit_of(model, x), x)
+def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
+    """Return how every parameter and intermediate may change with states, inputs and time."""
+    states = [q.name for c in model.components if c.gain is None for q in c.states]
+    known = {i.name: i.unit for i in model.structure.inputs}
+    marked = [p for p in ports.ports_of(model) if p.kind == "intermediate"]
+    attacheds: list[Attached] = []
+    for port in (*ports.parameter_ports(model), *marked):
+        attacheds += [_with(port, x, ports.unit_of(model, x), sizes.signals[x]) for x in states]
+        attacheds += [_with(port, u, unit, sizes.signals[u]) for u, unit in known.items()]
+        attacheds.append(_with(port, "time", "s", sizes.duration))
+    return tuple(attacheds)
+
+
+def _with(port: ports.Port, x: str, unit: str, size: float) -> Attached:
+    p = port.variable if port.kind == "parameter" else ports.true_sum(port.variable)
+
+    def law(s: Symbols, item: Own) -> Expression:
+        part = getattr(s, x) / item("range")
+        curve = ca.cos(item("angle")) * part + ca.sin(item("angle")) * part**2
+        return item("size") * getattr(s, p) * curve
+
+    return at_port(
+        port, f"change_of_{port.variable}_with_{x}", law,
+        words=(
+            "it drifts: ageing, heat, wear" if x == "time" else f"it depends on {x}",
+            "first two terms of its series",
+            f"Q = {p} (1 + size (cos(angle) r + sin(angle) r^2)),  r = {x}/range",
+            "what the parameter stands for is another one at another level or time",
+        ),
+        parameters=(
+            Parameter(
+                "size", 0.0, "1", (-_MOST, _MOST), "relative change at the range's end",
+                scale=_CHANGES,
+            ),
+            replace(ANGLE, description="form of the curve: 0 straight, pi/2 quadratic"),
+            scale_of("range", size, unit, x),
+        ),
+    )  # fmt: skip
 
 
 def effects_of(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return every generic effect at every port of a model that has no effects yet."""
     result, imported = list[Attached](), bool(model.structure.foreign)
-    for port in ports_of(model):
+    for port in ports.ports_of(model):
         if port.kind != "rate":
             result += signal_effects(port, sizes, imported=imported)
-        if port.kind == "rate" or is_place(model, port):
+        if port.kind == "rate" or ports.is_place(model, port):
             result += sum_effects(model, port, sizes)
     return (*result, *changing(model, sizes))

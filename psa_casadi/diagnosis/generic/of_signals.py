@@ -24,7 +24,7 @@ from psa_casadi.diagnosis.generic.attached import (
     size_of,
 )
 from psa_casadi.model.ports import Port, true_sum
-from psa_casadi.shapes import ANGLES, pade_section, softplus
+from psa_casadi.shapes import pade_section, softplus
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.variables import Parameter, State
 
@@ -124,7 +124,6 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
 def _gain(port: Port, sizes: Sizes) -> Attached:
     return _made(
         port, "gain", lambda s, q, item: item("size") * q,
-        gain="size",
         words=(
             "its gain is another one",
             "amplifier, scale of a sensor, a wrong unit",
@@ -173,7 +172,6 @@ def _bend(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
     return _made(
         port, "bend", lambda s, q, item: item("size") * bent(q / item("range"), item("angle")),
-        gain="size",
         words=(
             "its gain depends on its level",
             "first two terms of a static curve beyond the straight line",
@@ -181,11 +179,9 @@ def _bend(port: Port, sizes: Sizes) -> Attached:
             "harmonics that grow with the level, at every frequency alike",
         ),
         parameters=(
-            size_of(port.unit, size, "deviation from the line at the range's end"),
-            ANGLE,
+            size_of(port.unit, size, "deviation from the line at the range's end"), ANGLE,
             scale_of("range", size, port.unit, port.variable),
         ),
-        probe={"angle": ANGLES},
     )  # fmt: skip
 
 
@@ -250,7 +246,6 @@ def _zero(port: Port, sizes: Sizes) -> Attached:
 def _drift(port: Port, sizes: Sizes) -> Attached:
     return _made(
         port, "drift", lambda s, q, item: item("size") * s.time / item("duration"),
-        gain="size",
         words=(
             "its zero drifts with time",
             "sensor that warms up",

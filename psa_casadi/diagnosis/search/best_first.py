@@ -9,34 +9,13 @@ one of them is better; where much is left, from another base and with all effect
 
 import numpy as np
 
-from psa_casadi.diagnosis.base_fit import (
-    SEEN,
-    from_band,
-    from_resonances,
-    instead_of,
-    instead_of_mode,
-    ringing,
-    rings,
-)
+from psa_casadi.diagnosis import base_fit
 from psa_casadi.diagnosis.colour import noise_rms
-from psa_casadi.diagnosis.families import Shown
+from psa_casadi.diagnosis.families import CauseEvidence
 from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.search.fits import (
-    afresh,
-    any_afresh,
-    together,
-    with_cause,
-    without,
-)
+from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
-from psa_casadi.diagnosis.search.known import FINALISTS, NONE, Known, Names
-from psa_casadi.diagnosis.search.moves import (
-    exchange,
-    fit_from_other_parents,
-    fit_sets,
-    one_mode,
-    with_modes,
-)
+from psa_casadi.diagnosis.search.state import FINALISTS, NONE, Names, SearchState
 from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.notes import note
@@ -58,7 +37,7 @@ _BETTER, _RINGING = 0.95, 0.4
 _PACE = 2
 
 
-def best_first(base: Fit, task: Task, before: Known | None = None) -> Known:
+def best_first(base: Fit, task: Task, before: SearchState | None = None) -> SearchState:
     """Return what a search from a base fit finds. Raises SimulationError where that one fails.
 
     Where its work goes beyond the method's budget it begins nothing more, and says what it left.
@@ -71,7 +50,7 @@ def best_first(base: Fit, task: Task, before: Known | None = None) -> Known:
         try:
             search.run()
         except KeyboardInterrupt:
-            task.keep(search.known.so_far().fit)
+            task.keep(next(h for h in search.known.ranked() if h.final).fit)
             raise
     return search.known
 
@@ -80,7 +59,7 @@ class _Search:
     """The state of one search."""
 
     def __init__(self, base: Fit, task: Task, work: Work) -> None:
-        self.task, self.work, self.known = task, work, Known(base, task)
+        self.task, self.work, self.known = task, work, SearchState(base, task)
         self.left: list[str] = []
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
@@ -88,15 +67,15 @@ class _Search:
         self.shaken: dict[Names, Fit] = {}
         self.tried: set[tuple[Fit, str]] = set()
 
-    def go_on(self, before: Known) -> None:
+    def go_on(self, before: SearchState) -> None:
         """Take over what a search with fewer effects has fitted, and what it has tried."""
-        for h in before.found.values():
+        for h in before.hypotheses.values():
             if h.causes:
                 self.known.note(h)
         self.tried = {
-            (h.fit, n) for h in before.found.values() for n in before.fitted.get(h.names, ())
+            (h.fit, n) for h in before.hypotheses.values() for n in before.fitted.get(h.names, ())
         }
-        ended = [h.names for h in before.found.values() if h.causes and h.final]
+        ended = [h.names for h in before.hypotheses.values() if h.causes and h.final]
         self.done |= {(what, names) for what in ("base again", "challenged") for names in ended}
 
     def run(self) -> None:
@@ -106,14 +85,14 @@ class _Search:
                 break
             if self.expanded and not self.does("neighbours"):
                 break
-            self.known.tell(chosen, "visited")
+            self.known.notify(chosen, "visited")
             self.visit(chosen)
         while self.led(self.known.best()):
             pass
         best = self.known.best()
         if len(best.causes) > 1 and self.known.view(best).test.alarm:
             self.task.progress("all causes to the end")
-            self.known.note(together(best, self.task.experiments))
+            self.known.note(fits.together(best))
         self.known.conclude()
         if self.left:
             left = tuple(dict.fromkeys(self.left))
@@ -138,17 +117,13 @@ class _Search:
         if self.led(self.known.ranked()[0]):
             return self.next()
         best = self.known.best()
-        way = [self.known.found.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
-        for item in way:
-            if (
-                item is not None
-                and (item is best or item.names in self.expanded)
-                and self.unseen(item)
-            ):
-                return item
+        way = [self.known.hypotheses.get(best.names_upto(k)) for k in range(len(best.causes) + 1)]
+        for h in way:
+            if h and (h is best or h.names in self.expanded) and self.is_new(h):
+                return h
         if best.causes and self.once("exchange", best.names):
             if self.does("exchange"):
-                exchange(best, self.known, self.task)
+                moves.exchange(best, self.known)
             return self.next()
         if self.known.is_open(best):
             return self.next() if self.otherwise() else self.rejected()
@@ -159,8 +134,8 @@ class _Search:
 
     def is_small(self, h: Hypothesis) -> bool:
         """Whether causes are so small beside the noise that others may be as likely."""
-        displayed = Shown(self.known.scale.evidence(h), len(h.fit.residuals))
-        return bool(h.causes) and displayed.known(self.task.limits) < _SURELY
+        shown = CauseEvidence(self.known.scale.evidence(h), len(h.fit.residuals))
+        return bool(h.causes) and shown.listed_probability(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
@@ -170,9 +145,9 @@ class _Search:
         if not self.does("rejected"):
             return None
         for h in self.known.rejected():
-            if len(h.causes) < self.task.limits.most_causes and self.unseen(h):
+            if len(h.causes) < self.task.limits.most_causes and self.is_new(h):
                 self.known.finish([] if h.final else [h])
-                return self.known.found.get(h.names)
+                return self.known.hypotheses.get(h.names)
         return None
 
     def otherwise(self) -> bool:
@@ -198,18 +173,21 @@ class _Search:
         """
         new = bool(h.causes) and h.final and self.once("base again", h.names)
         for cause in h.causes if new else ():
-            less = self.known.found.get(h.names - {cause.name})
+            less = self.known.hypotheses.get(h.names - {cause.name})
             if (less is None or not cause.more_of) and self.does("base again"):
                 self.task.progress(f"without {cause.name}")
-                self.known.note(without(h, cause, self.task.experiments, less))
+                self.known.note(fits.without(h, cause, less))
         return new
 
-    def unseen(self, h: Hypothesis) -> bool:
+    def is_new(self, h: Hypothesis) -> bool:
         """Whether a hypothesis was not visited yet, or has become much better since."""
         last = self.expanded.get(h.names)
         if last is None or h.fit.rms < _BETTER * last.fit.rms:
             return True
-        return h is self.known.best() and self.known.gained(last, h)
+        if h is not self.known.best():
+            return False
+        scale = self.known.scale
+        return scale.evidence(h) > scale.evidence(last) + scale.limits.price
 
     def visit(self, h: Hypothesis) -> None:
         """Fit the neighbours of a hypothesis: fewer causes, other bases, then more causes."""
@@ -240,26 +218,25 @@ class _Search:
     @stage("fits of candidates")
     def add_causes(self, h: Hypothesis, view: View) -> None:
         """Fit with one more cause, from the hypothesis, afresh, and the leading ones to the end."""
-        task, experiments = self.task, self.task.experiments
         leading = [s for s in view.leading() if self.known.different(s[0].direction.effect, h)]
         leading = [s for s in leading if (h.fit, s[0].direction.effect.name) not in self.tried]
         names = [scores[0].direction.effect.name for scores in leading]
         if not names:
             return
-        self.tell(h, f"fitting {', '.join(names)}")
-        for result in side_by_side(lambda s: with_cause(h, experiments, s), leading[:_PACE]):
+        self.report(h, f"fitting {', '.join(names)}")
+        for result in side_by_side(lambda s: fits.with_cause(h, s), leading[:_PACE]):
             self.known.note(result)
         self.known.remember(h, *names)
         best = max(self.known.children(h), key=lambda c: c.removes(h), default=None)
         goal = self.known.near(h, best) if best is not None else np.inf
         rest = leading[_PACE:]
         if rest and self.does("other effects"):
-            for result in side_by_side(lambda s: with_cause(h, experiments, s, goal), rest):
+            for result in side_by_side(lambda s: fits.with_cause(h, s, goal), rest):
                 self.known.note(result)
-        if "fits afresh" not in task.method.without:
+        if "fits afresh" not in self.task.method.without:
             self.fit_afresh(h, view)
             if self.does("other parents"):
-                fit_from_other_parents(h, self.known, task)
+                moves.fit_from_other_parents(h, self.known)
         leaders = [c for c in self.known.leaders(h) if not c.final]
         self.known.finish(leaders[: FINALISTS if self.does("finalists") else 1])
 
@@ -269,23 +246,23 @@ class _Search:
 
         Where fast records show several, or where one leaves structure.
         """
-        name, experiments = STRUCTURAL_MODE.name, self.task.experiments
+        name = STRUCTURAL_MODE.name
         if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
             return False
-        less = self.known.found.get(h.names - {name})
+        less = self.known.hypotheses.get(h.names - {name})
         if less is None or not (name in h.names or (self.task.fast and not h.causes)):
             return False
         if self.shaken.get(less.names) is less.fit or not self.does("several modes"):
             return False
         self.shaken[less.names] = less.fit
-        self.tell(less, "several modes at once")
-        result = with_modes(less, experiments)
+        self.report(less, "several modes at once")
+        result = moves.with_modes(less)
         if result is None:
             return False
         self.known.note(result)
         single = view.starts_of(name) if less is h else []
         if single:
-            self.known.note(with_cause(h, experiments, single))
+            self.known.note(fits.with_cause(h, single))
         self.known.remember(less, result.causes[-1].name, name)
         return self.known.best().names == result.names
 
@@ -294,7 +271,7 @@ class _Search:
         if self.sets_of is self.known.root or not self.does("several at once"):
             return
         self.sets_of = self.known.root
-        fit_sets(self.known, self.task, h)
+        moves.fit_sets(self.known, h)
 
     @stage("fits afresh")
     def fit_afresh(self, h: Hypothesis, view: View) -> None:
@@ -305,8 +282,8 @@ class _Search:
             best = max(self.known.children(h), key=lambda c: c.removes(h))
             if best.fit.rms < _SETTLED * floor or not self.does("fits afresh"):
                 break
-            self.tell(h, f"{child.causes[-1].name} afresh")
-            self.known.note(afresh(h, self.task.experiments, child, self.known.near(h, best)))
+            self.report(h, f"{child.causes[-1].name} afresh")
+            self.known.note(fits.fit_from_default(h, child, self.known.near(h, best)))
 
     @stage("fits afresh")
     def all_afresh(self) -> None:
@@ -314,8 +291,8 @@ class _Search:
         view = self.known.view(root)
         done = [c.causes[-1].name for c in self.known.children(root)[:_AFRESH]]
         scores = [s for n, s in view.screening.best_by_effect().items() if n not in done]
-        self.tell(root, "all other effects afresh")
-        result = any_afresh(root, self.task.experiments, scores)
+        self.report(root, "all other effects afresh")
+        result = fits.fit_any_from_default(root, scores)
         if result is not None:
             self.known.note(result)
             self.known.remember(root, result.causes[-1].name)
@@ -327,19 +304,19 @@ class _Search:
         """
         self.led(h)
         task = self.task
-        before = self.known.found.get(h.names_upto(len(h.causes) - 1))
+        before = self.known.hypotheses.get(h.names_upto(len(h.causes) - 1))
         if before is not None and h.causes[-1].more_of and self.known.view(h).test.alarm:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
-            for one in one_mode(h, before, task.experiments):
+            for one in moves.one_mode(h, before):
                 self.known.note(one)
             self.known.remember(before, STRUCTURAL_MODE.name)
         if before is None or has_series(h) or not self.does("resonances"):
             return
         last, fit = h.causes[-1], None
-        if rings(last):
-            fit = instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
-        if fit is None and not before.causes and not self.unseen(before):
-            fit = instead_of(before.fit, h.fit, task.experiments, task.progress)
+        if base_fit.rings(last):
+            fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
+        if fit is None and not before.causes and not self.is_new(before):
+            fit = base_fit.instead_of(before.fit, h.fit, task.experiments, task.progress)
         self.known.note(hypothesis(before.causes, fit, task.experiments, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
@@ -356,27 +333,27 @@ class _Search:
             return True
         if not self.once("ringing", h.names):
             return False
-        rung = ringing(h.fit, experiments)
-        if rung is None or rung.decrease < SEEN:
+        rung = base_fit.ringing(h.fit, experiments)
+        if rung is None or rung.decrease < base_fit.SEEN:
             return False
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
-        fit = from_band(h.fit, experiments, task.progress)
+        fit = base_fit.from_band(h.fit, experiments, task.progress)
         item = hypothesis(h.causes, fit, experiments, final=True)
         if item is not None and (h.causes or not examine(item, task, self.known.trials).leaves):
             self.known.note(item)
-        return self.known.found.get(h.names) is not h
+        return self.known.hypotheses.get(h.names) is not h
 
     def seen_in_records(self) -> bool:
         """Fit the base from resonances and lags that the records show; whether it is better."""
         root, task = self.known.root, self.task
         if not self.once("resonances", NONE) or not self.does("resonances"):
             return False
-        fitted = from_resonances(root.fit, task.experiments, task.progress)
+        fitted = base_fit.from_resonances(root.fit, task.experiments, task.progress)
         self.known.note(hypothesis((), fitted, task.experiments, final=True))
         return self.known.root is not root
 
-    def tell(self, h: Hypothesis, what: str) -> None:
+    def report(self, h: Hypothesis, what: str) -> None:
         self.task.progress(f"cause {len(h.causes) + 1}: {what}")
 
 

@@ -17,6 +17,7 @@ from psa_casadi.identification.start.ordinary import has_loop, ordinary_values
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import is_stack
+from psa_casadi.variables import Parameter
 
 #: Evaluations of a quick fit from a direction; with what it held, free again.
 QUICK, _FREED = 8, 3
@@ -44,8 +45,8 @@ def quick_fit(
     for values, gain, memory in starts:
         least = min([goal, before.cost, *(f.cost for f in fits)])
         added = [(effect, values, gain)]
-        item = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
-        fits += [item] if item is not None else []
+        quick = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
+        fits += [quick] if quick is not None else []
     if not any(f.cost < before.cost for f in fits):
         nested, states = [(effect, starts[0][0], 0.0)], tuple(before.starts())
         last = fit_with_all(before, experiments, nested, states, {}, 3 * QUICK, goal)
@@ -75,12 +76,11 @@ def fit_with_all(
         model = before.model
         try:
             for effect, values, gain in added:
-                low, high = next(p.bounds for p in effect.parameters if p.name == effect.gain)
-                moved = effect.linear or effect.gain in effect.fitted
-                item = share * gain if moved else gain
+                low, high = _parameter(effect, effect.gain).bounds
+                size = share * gain if effect.linear or effect.gain in effect.fitted else gain
                 if not effect.linear:
-                    item = float(np.clip(item, 0.9 * low, 0.9 * high))
-                model = model.with_effect(effect, {**effect.at_gain(item, values), **reset})
+                    size = float(np.clip(size, 0.9 * low, 0.9 * high))
+                model = model.with_effect(effect, {**effect.at_gain(size, values), **reset})
             result = fit(
                 model,
                 weighted(before, experiments),
@@ -133,13 +133,14 @@ def continued(
     )
 
 
-def cost_beside(other: Fit, of: Fit, experiments: Sequence[Experiment]) -> float:
+def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
     """Return the sum of squares that another fit leaves, weighted by the noise levels of a fit.
 
     Of the displacement and of further columns.
     """
-    parts = [*zip(other.residuals_of(experiments), of.sigma, strict=True)]
-    parts += [(f.residuals, g.level) for f, g in zip(other.further, of.further, strict=True)]
+    parts = [*zip(other.fit.residuals_of(of.experiments), of.fit.sigma, strict=True)]
+    pairs = zip(other.fit.further, of.fit.further, strict=True)
+    parts += [(f.residuals, g.level) for f, g in pairs]
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
 
 
@@ -158,7 +159,6 @@ _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
 def with_cause(
     before: Hypothesis,
-    experiments: Sequence[Experiment],
     scores: Sequence[Score],
     goal: float = np.inf,
 ) -> Hypothesis | None:
@@ -168,13 +168,11 @@ def with_cause(
     """
     effect = scores[0].direction.effect
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
-    quick = quick_fit(before.fit, experiments, effect, starts, {}, goal=goal)
-    return hypothesis((*before.causes, effect), quick, experiments)
+    quick = quick_fit(before.fit, before.experiments, effect, starts, {}, goal=goal)
+    return hypothesis((*before.causes, effect), quick, before.experiments)
 
 
-def with_causes(
-    before: Hypothesis, experiments: Sequence[Experiment], start: Together, goal: float = np.inf
-) -> Hypothesis | None:
+def with_causes(before: Hypothesis, start: Together, goal: float = np.inf) -> Hypothesis | None:
     """Fit quickly with several more causes at once; None if that fails."""
     added = [
         (d.effect, d.values, d.unit_gain if d.finite else gain)
@@ -184,12 +182,12 @@ def with_causes(
         {k: v for d in start.directions for k, v in d.memory[r].items()} | item
         for r, item in enumerate(before.fit.starts())
     )
-    quick = fit_with_all(before.fit, experiments, added, memory, {}, _SET_AFRESH, goal)
-    return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
+    quick = fit_with_all(before.fit, before.experiments, added, memory, {}, _SET_AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
 
 
 def with_causes_afresh(
-    before: Hypothesis, experiments: Sequence[Experiment], start: Together, goal: float = np.inf
+    before: Hypothesis, start: Together, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit several more causes at once from an ordinary base, with gains of an ordinary size.
 
@@ -199,18 +197,17 @@ def with_causes_afresh(
     added = []
     for d, gain in zip(start.directions, start.gains, strict=True):
         linear = d.effect.linear  # the side to which the declared weights move with it
-        side = sum(_declared(d.effect, n) * d.values[n] for n in linear) if linear else 1.0
+        side = sum(_parameter(d.effect, n).value * d.values[n] for n in linear) if linear else 1.0
         size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), side * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
-    ordinary = _ordinary_base(before.fit, experiments)
-    states = _states(before.fit, ordinary)
-    quick = fit_with_all(before.fit, experiments, added, states, ordinary, _SET_AFRESH, goal)
-    return hypothesis((*before.causes, *(a[0] for a in added)), quick, experiments)
+    ordinary, states = _ordinary_base(before.fit, before.experiments)
+    quick = fit_with_all(before.fit, before.experiments, added, states, ordinary, _SET_AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
 
 
-def afresh(
-    before: Hypothesis, experiments: Sequence[Experiment], first: Hypothesis, goal: float = np.inf
+def fit_from_default(
+    before: Hypothesis, first: Hypothesis, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit the last cause of a hypothesis again from an ordinary base and gains of both signs.
 
@@ -219,25 +216,24 @@ def afresh(
     What is found is of use below the cost of the first fit, and below the `goal`.
     """
     effect = first.causes[-1]
-    fits = _from_ordinary(before.fit, experiments, effect, first.fit.model.values)
-    goal = min(goal, cost_beside(first.fit, before.fit, experiments))
-    final = _best_continued(fits, experiments, _CONTINUED, goal)
-    return hypothesis(first.causes, final, experiments)
+    fits = _from_ordinary(before.fit, before.experiments, effect, first.fit.model.values)
+    goal = min(goal, cost_beside(first, before))
+    final = _best_continued(fits, before.experiments, _CONTINUED, goal)
+    return hypothesis(first.causes, final, before.experiments)
 
 
-def any_afresh(
-    before: Hypothesis, experiments: Sequence[Experiment], scores: Sequence[Score]
-) -> Hypothesis | None:
+def fit_any_from_default(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
     """Fit the effects of the scores afresh; return the best of all."""
     results = side_by_side(
-        lambda d: _from_ordinary(before.fit, experiments, d.effect, d.values),
+        lambda d: _from_ordinary(before.fit, before.experiments, d.effect, d.values),
         [score.direction for score in scores],
     )
-    final = _best_continued([f for item in results for f in item], experiments, _CONTINUED_ANY)
+    every = [f for fits in results for f in fits]
+    final = _best_continued(every, before.experiments, _CONTINUED_ANY)
     if final is None:
         return None
     effect = next(e for e in final.model.components if e not in before.fit.model.components)
-    return hypothesis((*before.causes, effect), final, experiments)
+    return hypothesis((*before.causes, effect), final, before.experiments)
 
 
 def in_place(
@@ -246,7 +242,6 @@ def in_place(
     reached: Fit,
     item: Fit,
     effect: Component,
-    experiments: Sequence[Experiment],
     goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect beside the causes of `less`, where the `whole` has another one.
@@ -260,14 +255,13 @@ def in_place(
         values[effect.gain or ""],
         tuple({**s, **r} for s, r in zip(item.starts(), reached.starts(), strict=True)),
     )
-    return exchanged(whole, less, effect, start, reached, experiments, goal)
+    return exchanged(whole, less, effect, start, reached, goal)
 
 
 def like(
     whole: Hypothesis,
     less: Hypothesis,
     copy: Copy,
-    experiments: Sequence[Experiment],
     goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
@@ -278,7 +272,7 @@ def like(
     effect, direction = copy.direction.effect, copy.direction
     usable = copy.gain > 0 or not direction.one_sided
     start = (direction.values, copy.gain if usable else direction.unit_gain, direction.memory)
-    return exchanged(whole, less, effect, start, whole.fit, experiments, goal)
+    return exchanged(whole, less, effect, start, whole.fit, goal)
 
 
 def exchanged(
@@ -287,7 +281,6 @@ def exchanged(
     effect: Component,
     start: Start,
     reached: Fit,
-    experiments: Sequence[Experiment],
     goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect where the `whole` has the cause that `less` lacks, the rest as `reached`.
@@ -297,14 +290,13 @@ def exchanged(
     values = reached.model.values
     base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     causes = tuple(effect if c not in less.causes else c for c in whole.causes)
-    quick = quick_fit(less.fit, experiments, effect, [start], base, _BESIDE, goal)
-    return hypothesis(causes, quick, experiments)
+    quick = quick_fit(less.fit, less.experiments, effect, [start], base, _BESIDE, goal)
+    return hypothesis(causes, quick, less.experiments)
 
 
 def without(
     whole: Hypothesis,
     cause: Component,
-    experiments: Sequence[Experiment],
     known: Hypothesis | None = None,
 ) -> Hypothesis | None:
     """Fit without a cause from where the whole has led; None where that cannot be simulated.
@@ -320,48 +312,46 @@ def without(
     for share in _SHARES:
         try:
             start = model.with_values({n: share * model.values[n] for n in gains})
-            parts = weighted(whole.fit, experiments)
+            parts = weighted(whole.fit, whole.experiments)
             sigma = None if is_stack(start) else whole.fit.sigma
             result = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
         except PsaError:
             continue
-        return hypothesis(causes, result, experiments, final=True)
+        return hypothesis(causes, result, whole.experiments, final=True)
     return None
 
 
-def as_led(
-    whole: Hypothesis, cause: Component, experiments: Sequence[Experiment]
-) -> Hypothesis | None:
+def as_led(whole: Hypothesis, cause: Component) -> Hypothesis | None:
     """Return the model without a cause where the whole has led it, not fitted again.
 
     None where that cannot be simulated.
     """
     model = whole.fit.model.without([cause.name])
     names = [n for n in whole.fit.unknowns.names if n in model.values]
-    start, parts = replace(whole.fit, model=model), weighted(whole.fit, experiments)
+    start, parts = replace(whole.fit, model=model), weighted(whole.fit, whole.experiments)
     try:
         result = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
     except PsaError:
         return None
     causes = [c for c in whole.causes if c is not cause]
-    return hypothesis(causes, result, experiments)
+    return hypothesis(causes, result, whole.experiments)
 
 
-def together(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def together(of: Hypothesis) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:
-        result = refit(of.fit, weighted(of.fit, experiments), of.fit.unknowns.names)
+        result = refit(of.fit, weighted(of.fit, of.experiments), of.fit.unknowns.names)
     except PsaError:
         return None
-    return hypothesis(of.causes, result, experiments, final=True)
+    return hypothesis(of.causes, result, of.experiments, final=True)
 
 
-def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.inf) -> Hypothesis:
+def to_end(of: Hypothesis, goal: float = np.inf) -> Hypothesis:
     """Continue a fit until it converges, loosely first, then at full tolerance.
 
     One whose cost will stay above the `goal` is not final.
     """
-    current = of.fit
+    current, experiments = of.fit, of.experiments
     loosest = quick_rtol(current.sigma, experiments)
     for rtol, tolerance, evaluations in _POLISHING:
         try:
@@ -376,7 +366,7 @@ def to_end(of: Hypothesis, experiments: Sequence[Experiment], goal: float = np.i
     return ended or replace(of, final=True)
 
 
-def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def refit_at_bound(of: Hypothesis) -> Hypothesis | None:
     """Fit once more where a cause has come near the end of its range: another minimum may hold it.
 
     That cause begins with its declared values, at half and at twice its gain; what is found is of
@@ -387,22 +377,22 @@ def begun_again(of: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis
     if at_end is None:
         return None
     kept = {at_end.gain, *at_end.linear}
-    table = {n: _declared(at_end, n) for n in at_end.fitted if n not in kept}
+    table = {n: _parameter(at_end, n).value for n in at_end.fitted if n not in kept}
     gains = at_end.linear or (at_end.gain or "",)
 
     def begin(share: float) -> Fit | None:
         try:
             model = of.fit.model.with_values({**table, **{n: share * values[n] for n in gains}})
             start = replace(of.fit, model=model)
-            rtol = quick_rtol(of.fit.sigma, experiments)
-            return continued(start, experiments, rtol, 1e-3, _AFRESH, of.fit.cost)
+            rtol = quick_rtol(of.fit.sigma, of.experiments)
+            return continued(start, of.experiments, rtol, 1e-3, _AFRESH, of.fit.cost)
         except PsaError:
             return None
 
     fits = [f for f in side_by_side(begin, _AGAIN) if f is not None and f.cost < of.fit.cost]
     best = min(fits, key=lambda f: f.cost, default=None)
-    result = hypothesis(of.causes, best, experiments)
-    return None if result is None else to_end(result, experiments)
+    result = hypothesis(of.causes, best, of.experiments)
+    return None if result is None else to_end(result)
 
 
 def _from_ordinary(
@@ -412,8 +402,7 @@ def _from_ordinary(
     known: Mapping[str, float],
 ) -> list[Fit]:
     """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
-    gain = next(p for p in effect.parameters if p.name == effect.gain)
-    size = _typical(before, effect)
+    gain, size = _parameter(effect, effect.gain), _typical(before, effect)
     sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
     if gain.bounds[0] < 0:
         sizes.append(-_ORDINARY)
@@ -421,30 +410,28 @@ def _from_ordinary(
     loops = (False, True) if has_loop(before.model) else (False,)
     bases = [_ordinary_base(before, experiments, soon=soon) for soon in loops]
 
-    def begun(start: tuple[dict[str, float], float]) -> Fit | None:
-        ordinary, share = start
-        added, states = [(effect, values, share * size)], _states(before, ordinary)
+    def start(base: tuple[_Base, float]) -> Fit | None:
+        (ordinary, states), share = base
+        added = [(effect, values, share * size)]
         return fit_with_all(before, experiments, added, states, ordinary, QUICK)
 
     starts = list(itertools.product(bases, sizes))
-    return [f for f in side_by_side(begun, starts) if f is not None]
+    return [f for f in side_by_side(start, starts) if f is not None]
 
 
-def _ordinary_base(
-    before: Fit, experiments: Sequence[Experiment], *, soon: bool = False
-) -> dict[str, float]:
-    """Return the values of an ordinary stack; any other model goes on from its own."""
-    if not is_stack(before.model):
-        return {}
-    return ordinary_values(before.model, [e.record for e in fitted(experiments)], soon=soon)
+#: Values of a base, and the states in which records begin.
+_Base = tuple[dict[str, float], tuple[dict[str, float], ...]]
 
 
-def _states(before: Fit, ordinary: Mapping[str, float]) -> tuple[dict[str, float], ...]:
-    """Return the states in which records begin; of an ordinary stack they are at rest.
+def _ordinary_base(before: Fit, experiments: Sequence[Experiment], *, soon: bool = False) -> _Base:
+    """Return an ordinary stack at rest; any other model goes on from its own values and states.
 
-    Those of a loop that is bent would bend the ordinary one.
+    The states of a loop that is bent would bend the ordinary one.
     """
-    return () if ordinary else tuple(before.starts())
+    if not is_stack(before.model):
+        return {}, tuple(before.starts())
+    records = [e.record for e in fitted(experiments)]
+    return ordinary_values(before.model, records, soon=soon), ()
 
 
 def _best_continued(
@@ -465,17 +452,17 @@ def _best_continued(
 
 def _typical(before: Fit, effect: Component) -> float:
     """Return an ordinary size of an effect's gain beside a fit."""
-    gain = next(p for p in effect.parameters if p.name == effect.gain)
+    gain = _parameter(effect, effect.gain)
     return gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
 
 
 def _ordinary_form(effect: Component, known: Mapping[str, float]) -> dict[str, float]:
     """Return an effect's declared values where it has trials; forms and frequencies are `known`."""
     return {
-        n: known[n] if isinstance(grid, str) or n not in effect.fitted else _declared(effect, n)
-        for n, grid in effect.probe.items()
+        n: known[n] if isinstance(g, str) or n not in effect.fitted else _parameter(effect, n).value
+        for n, g in effect.probe.items()
     }
 
 
-def _declared(effect: Component, name: str) -> float:
-    return next(p.value for p in effect.parameters if p.name == name)
+def _parameter(effect: Component, name: str | None) -> Parameter:
+    return next(p for p in effect.parameters if p.name == name)

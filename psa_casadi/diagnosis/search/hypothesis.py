@@ -23,10 +23,12 @@ import scipy
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
+from psa_casadi.diagnosis.noise import known_colour
 from psa_casadi.diagnosis.omnibus import Omnibus
 from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
+from psa_casadi.diagnosis.process_noise import entering
 from psa_casadi.diagnosis.screening import (
     Score,
     Screening,
@@ -47,33 +49,34 @@ from psa_casadi.units import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model with some causes beside the base, fitted to the records.
+    """A model with some causes beside the base, fitted to the records of `experiments`.
 
-    `causes` are in the order in which the search found them; `shown` (n, channels) are the
+    `causes` are in the order in which the search found them; `predictions` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
     held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
-    `own` is the colour that every channel's residual has by itself; `final` says that the fit went
+    `colours` are those that every channel's residual has by itself; `final` says that the fit went
     on to its end.
     """
 
     causes: tuple[Component, ...]
     fit: Fit
-    shown: tuple[FloatArray, ...]
+    experiments: Sequence[Experiment]
+    predictions: tuple[FloatArray, ...]
     held: tuple[float, ...]
     train: tuple[float, ...]
     whole: tuple[float, ...]
-    own: tuple[OwnColour, ...]
+    colours: tuple[OwnColour, ...]
     final: bool = False
 
     @property
     def predicted(self) -> tuple[FloatArray, ...]:
         """The predictions (n,) of the first channel."""
-        return tuple(y[:, 0] for y in self.shown)
+        return tuple(y[:, 0] for y in self.predictions)
 
     @property
     def colour(self) -> Colour:
         """The colour of its own residual, in every channel's fitted samples."""
-        first, *others = (item.colour for item in self.own)
+        first, *others = (item.colour for item in self.colours)
         return replace(first, further=tuple(others))
 
     def beyond_noise(self, before: "Hypothesis", held: Sequence[int], chance: float) -> float:
@@ -83,18 +86,13 @@ class Hypothesis:
         out, of which noise of the other one's colour leaves few independent ones. Less than 0 where
         noise of another colour explains the data as well [nats].
         """
-        rows = list(zip(self.fit.channels, before.own, self.own, strict=True))
+        rows = list(zip(self.fit.channels, before.colours, self.colours, strict=True))
         gained = sum(new.nats(f.straight) - old.nats(f.straight) for f, old, new in rows)
         levels = [float(np.hypot(new.level, f.straight)) for f, _, new in rows]
         straight = [f.straight for f in self.fit.channels]
         ahead = held_out_gain(held, before.colour, straight, before.held, self.held) if held else 0
         spent = occam(before.fit, self.fit, self.colour, levels)
         return gained + max(ahead - chance, 0.0) - spent
-
-    @property
-    def holdout_rms(self) -> float:
-        """The error of the first channel in held-out samples."""
-        return self.held[0]
 
     @property
     def errors(self) -> tuple[float, ...]:
@@ -172,14 +170,28 @@ def hypothesis(
         colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
     return Hypothesis(
-        tuple(causes), fit, displayed, held_rms, train_rms, whole, tuple(colours), final
+        tuple(causes),
+        fit,
+        experiments,
+        displayed,
+        held_rms,
+        train_rms,
+        whole,
+        tuple(colours),
+        final,
     )
 
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     """Return a hypothesis with noise that enters its model, if that is likelier."""
-    item = task.pack.entering(of.fit, task.experiments, of.shown, of.own)
-    return replace(of, own=item)
+    if task.pack.is_stack:
+        return of  # noise of any colour is the sensor's
+    own = []
+    for k, (f, colour) in enumerate(zip(of.fit.channels, of.colours, strict=True)):
+        pairs = zip(of.experiments, of.predictions, strict=True)
+        errors = [e.errors(f.number, y[:, k]) for e, y in pairs]
+        own.append(entering(of.fit, of.experiments, errors, k, colour))
+    return replace(of, colours=tuple(own))
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
@@ -234,11 +246,9 @@ class Scale:
         return self.evidence(of) - self.limits.price * len(of.causes)
 
 
-def scale_of(
-    base: Hypothesis, colour: Colour, limits: Thresholds, experiments: Sequence[Experiment]
-) -> Scale:
+def scale_of(base: Hypothesis, colour: Colour, limits: Thresholds) -> Scale:
     """Return the scale of a search; blocks of fitted records choose, whole records judge alone."""
-    numbers = [f.number for f in base.fit.channels]
+    experiments, numbers = base.experiments, [f.number for f in base.fit.channels]
     held = tuple(sum(int(e.at(j, e.held_out).sum()) for e in experiments) for j in numbers)
     return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
@@ -282,8 +292,8 @@ class View:
         further start differs from the best one in as many trial values as it can. One that is
         looked for with both signs of its gain begins at each of these steps, too.
         """
-        items = [s for s in self.screening.scores if s.direction.effect.name == name]
-        near = [s for s in items if s.decrease >= 0.3 * items[0].decrease]
+        scores = [s for s in self.screening.scores if s.direction.effect.name == name]
+        near = [s for s in scores if s.decrease >= 0.3 * scores[0].decrease]
         starts: list[Score] = []
 
         def form(score: Score) -> dict[str, float]:
@@ -302,8 +312,8 @@ class View:
             new = score.direction.values not in known or score.direction.finite
             if new and score not in starts and len(starts) < _STARTS:
                 starts.append(score)
-        both = min(items[0].direction.effect.finite_step, default=0.0) < 0.0
-        return starts + [s for s in items if both and s.direction.finite and s not in starts]
+        both = min(scores[0].direction.effect.finite_step, default=0.0) < 0.0
+        return starts + [s for s in scores if both and s.direction.finite and s not in starts]
 
     @property
     def promise(self) -> float:
@@ -316,9 +326,9 @@ class View:
 
         Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
         """
-        observed = self.decrease >= self.screening.threshold
-        observed = observed and self.pack.shows(self.of.fit, self.promise, self.test)
-        return observed and (self.test.alarm or not self.of.causes)
+        fit, asked = self.of.fit, self.test.alarm or not self.of.causes
+        significant = self.decrease >= self.screening.threshold
+        return significant and self.pack.shows(fit, self.promise, self.test) and asked
 
     @property
     def leaves(self) -> bool:
@@ -336,7 +346,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     and it asks whether the residual is as large everywhere.
     """
     task.progress("screening effects")
-    fit, experiments = of.fit, task.experiments
+    fit, experiments = of.fit, of.experiments
     effects = [e for e in task.table if e not in fit.model.components]
     kept: list[Direction] = []
     if known:
@@ -346,14 +356,14 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     finite = "finite steps" not in task.method.without
     kept += directions(fit, experiments, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
-    residuals, colour, item = [f.residuals for f in fit.channels], screening.colour, False
-    if not of.causes:  # is there anything but noise of some colour?
-        item, tested = True, [c.tested for c in of.own]
+    residuals, colour, alone = [f.residuals for f in fit.channels], screening.colour, not of.causes
+    if alone:  # is there anything but noise of some colour?
+        tested = [c.tested for c in of.colours]
         residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
         colour = replace(colour, further=tuple(others))
-    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=item)
-    coloured = item and any(c.autoregression.size for c in of.own)
-    if coloured and kept and task.pack.asks_effects and not test.alarm:
+    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=alone)
+    coloured = alone and any(c.autoregression.size for c in of.colours)
+    if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
     return View(of, tuple(kept), screening, test, task.pack)
 
@@ -372,27 +382,26 @@ def _asked(
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
     share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
     size = float(np.sqrt(min(share, 1.0))) * fit.rms
-    requested = replace(test, p_value=p, seen="effect", size=size)
+    requested = replace(test, p_value=p, structure="effect", size=size)
     return requested if requested.alarm else test
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
-    lengths = [int(e.at(0).sum()) for e in task.experiments]
-    known, colour = task.pack.colours(fit, task.experiments), None
+    experiments, known, colour = task.experiments, None, None
+    lengths = [int(e.at(0).sum()) for e in experiments]
     if "remainder" in task.method.without:
-        known, colour = None, residual_colour(fit.residuals, lengths)
+        colour = residual_colour(fit.residuals, lengths)
+    elif task.pack.is_stack:
+        pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+        known = [known_colour(e.record, r) for e, r in pairs]
     return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
 
 
-#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
-_SAME = 1.0
 #: Share of a range that is near its end.
 _END = 0.1
 
 
-def held_out_confirms(
-    of: Hypothesis, before: Hypothesis, experiments: Sequence[Experiment], scale: Scale
-) -> bool:
+def held_out_confirms(of: Hypothesis, before: Hypothesis, scale: Scale) -> bool:
     """Whether held-out samples do not speak against what a hypothesis adds to another one.
 
     The rule is `confirmed`; a change of prediction with the sum of squares D promises D/2 over the
@@ -402,7 +411,7 @@ def held_out_confirms(
         return True
     promise = 0.0
     for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
-        rows = zip(experiments, of.shown, before.shown, strict=True)
+        rows = zip(of.experiments, of.predictions, before.predictions, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )
@@ -423,14 +432,6 @@ def confirmed(gained: float, promise: float, score: float, limits: Thresholds = 
     """
     least = min(limits.held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
     return bool(gained > least and score + gained > limits.held_out)
-
-
-def another_minimum(gained: float, held_out: float) -> bool:
-    """Whether a fit of the same causes is another minimum that takes the other one's place.
-
-    It has `gained` more evidence, and held-out samples do not object by more than that [nats].
-    """
-    return gained > _SAME and gained + held_out > 0.0
 
 
 def near_end(values: Mapping[str, float], effect: Component) -> bool:

@@ -1,4 +1,4 @@
-"""Moves of the search beside one effect more: modes, exchanges, several at once."""
+"""Moves of the search beside one effect more: modes, exchanges, several at once, rivals."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -6,22 +6,10 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from psa_casadi.component import Component
-from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies
-from psa_casadi.diagnosis.search.fits import (
-    Start,
-    cost_beside,
-    exchanged,
-    fit_with_all,
-    in_place,
-    like,
-    to_end,
-    with_cause,
-    with_causes,
-    with_causes_afresh,
-)
+from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies, temperature
+from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
-from psa_casadi.diagnosis.search.known import FINALISTS, NEAR, Known, nearly
+from psa_casadi.diagnosis.search.state import FINALISTS, NEAR, SearchState, nearly
 from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
 from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
@@ -47,13 +35,14 @@ _ALONE = 3
 _RTOL = 1e-4
 
 
-def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothesis | None:
+def with_modes(before: Hypothesis) -> Hypothesis | None:
     """Fit with a series of modes; None where the residual shows fewer than two, or no fit works.
 
     Modes that a fit damps until they ring no more are left out: they stand for something else.
     """
     if "wafer_force" not in before.fit.model.structure.balances:
         return None
+    experiments = before.experiments
     even = [k for k, e in enumerate(experiments) if not e.held_out_whole and _even(e.record.time)]
     most = _ENOUGH // max(1, len(even))
     shaken, free = [], []
@@ -78,7 +67,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
             for name, value in asdict(mode).items()
         }
         added = [(effect, values, 1.0)]
-        result = fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        result = fits.fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
         if result is None:
             return None
         ringing = [m for m in _modes(result, len(modes)) if m.damping < MOST_DAMPED]
@@ -90,9 +79,7 @@ def with_modes(before: Hypothesis, experiments: Sequence[Experiment]) -> Hypothe
     return None
 
 
-def one_mode(
-    series: Hypothesis, less: Hypothesis, experiments: Sequence[Experiment]
-) -> list[Hypothesis]:
+def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """Fit one mode in the place of a series, from each of those, and the best to the end.
 
     The series is the last cause; `less` is the hypothesis without it. The base begins where the
@@ -101,18 +88,16 @@ def one_mode(
     fit = series.fit
     states = tuple(fit.starts())
     low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
-    starts: list[Start] = []
+    starts: list[fits.Start] = []
     for mode in _modes(fit, series.causes[-1].count):
         lead = float(np.clip(mode.ahead / (mode.share or 1e-300), low, high))
         form = {
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    results = side_by_side(
-        lambda s: exchanged(series, less, STRUCTURAL_MODE, s, fit, experiments), starts
-    )
+    results = side_by_side(lambda s: fits.exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
     best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
-    return side_by_side(lambda h: to_end(h, experiments), best)
+    return side_by_side(fits.to_end, best)
 
 
 def _even(time: FloatArray) -> bool:
@@ -151,25 +136,25 @@ _MOST = 3
 
 
 @stage("causes judged again")
-def exchange(h: Hypothesis, known: Known, task: Task) -> None:
+def exchange(h: Hypothesis, known: SearchState) -> None:
     """Fit in each cause's place what the screening beside all others finds near it."""
     for cause in h.causes:
-        less = known.found.get(h.names - {cause.name})
+        less = known.hypotheses.get(h.names - {cause.name})
         if less is None:
             continue
         if len(h.causes) > 1:
             for starts in _near(h, less, known)[:_MOST]:
-                task.progress(f"{_effect(starts).name} in the place of {cause.name}")
-                _put_in_place(h, less, starts, known, task)
+                known.task.progress(f"{_effect(starts).name} in the place of {cause.name}")
+                _put_in_place(h, less, starts, known)
             known.remember(less, cause.name)
-        for copy in _copies(h, less, known, task):
+        for copy in _copies(h, less, known):
             name = copy.direction.effect.name
-            task.progress(f"{name}, which could copy {cause.name}")
-            known.note(like(h, less, copy, task.experiments, known.near(less, h)))
+            known.task.progress(f"{name}, which could copy {cause.name}")
+            known.note(fits.like(h, less, copy, known.near(less, h)))
             known.remember(less, name)
 
 
-def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
+def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Score]]:
     """Return the starts of effects that promise nearly what `h` gains beside the causes of `less`.
 
     They are not among the causes, and bend no curve that one of them bends.
@@ -187,41 +172,41 @@ def _near(h: Hypothesis, less: Hypothesis, known: Known) -> list[list[Score]]:
 
 
 def _put_in_place(
-    h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: Known, task: Task
+    h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: SearchState
 ) -> None:
     """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
 
     To the end where that comes near.
     """
     goal = known.near(less, h)
-    rival = with_cause(less, task.experiments, starts, goal)
+    rival = fits.with_cause(less, starts, goal)
     known.note(rival)
     if rival is None:
         return
     effect = _effect(starts)
-    known.note(in_place(h, less, h.fit, rival.fit, effect, task.experiments, goal))
+    known.note(fits.in_place(h, less, h.fit, rival.fit, effect, goal))
     known.remember(less, effect.name)
-    best = known.found.get(rival.names)
+    best = known.hypotheses.get(rival.names)
     if best is not None and known.scale.evidence(best) > known.scale.evidence(h) - NEAR:
         known.finish([best])
 
 
-def _copies(h: Hypothesis, less: Hypothesis, known: Known, task: Task) -> list[Copy]:
+def _copies(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[Copy]:
     """Return effects that could add what the cause not in `less` adds, but were not fitted so.
 
     A copy that leaves so little of the contribution's sum of squares D that D (1 - R^2)/2 is
     below `NEAR` might explain the data as well; a fit much worse than its copy was lost.
     """
-    pairs = zip(h.predicted, less.predicted, task.experiments, strict=True)
+    pairs = zip(h.predicted, less.predicted, h.experiments, strict=True)
     added = np.concatenate([(p - q)[e.at(h.fit.channels[0].number)] for p, q, e in pairs])
-    table = [e for e in task.table if e.name not in h.names]
+    table = [e for e in known.task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
-    power, result = copies(less.fit, added, trials, known.scale.colour, task.limits)
+    power, result = copies(less.fit, added, trials, known.scale.colour, known.task.limits)
     item = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in result.items():
         left = 0.5 * power * (1.0 - copy.share)
-        fitted = known.found.get(less.names | {name})
+        fitted = known.hypotheses.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
         if left < NEAR and reached < item - left - NEAR:
             lost[name] = left
@@ -239,7 +224,7 @@ _PAIRS = 2
 
 
 @stage("fits of several at once")
-def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
+def fit_sets(known: SearchState, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
     The cause that explains most alone, that of `h`, may stand for several and hold the search
@@ -247,8 +232,8 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     tried, as a fit that adds one cause to the other may end in another minimum than one that begins
     with both. These go to their end, since they need more steps for it.
     """
-    root, price = known.root, known.scale.limits.price
-    view, similar = known.view(root), task.alike(root.fit)
+    root, task, price = known.root, known.task, known.scale.limits.price
+    view, similar = known.view(root), task.indistinguishable(root.fit)
     if not view.trials:
         return
     every = [
@@ -262,44 +247,69 @@ def fit_sets(known: Known, task: Task, h: Hypothesis) -> None:
     items = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
     pairs = [s for s in ranked if s.names in items]
     apart = [s for s in ranked if not s.names & h.names]
-    starts = [s for s in [*pairs, *apart] if s.names not in known.found][:_SETS]
+    starts = [s for s in [*pairs, *apart] if s.names not in known.hypotheses][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
     task.progress(f"several causes: fitting {text}")
-    goal = cost_beside(known.best().fit, root.fit, task.experiments)
-    ways = [with_causes]
+    goal = fits.cost_beside(known.best(), root)
+    ways = [fits.with_causes]
     if "fits afresh" not in task.method.without:
-        ways.append(with_causes_afresh)
+        ways.append(fits.with_causes_afresh)
     jobs = [(way, s) for way in ways for s in starts]
-    results = side_by_side(lambda j: j[0](root, task.experiments, j[1], goal), jobs)
+    results = side_by_side(lambda j: j[0](root, j[1], goal), jobs)
     fitted = [f for f in results if f is not None]
     better = [f for f in fitted if f.names in items and known.scale.evidence(f) > 0.0]
     tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
     task.progress(f"{', '.join('+'.join(sorted(h.names)) for h in best)} to the end")
-    ended = side_by_side(lambda h: to_end(h, task.experiments, goal), best)
+    ended = side_by_side(lambda h: fits.to_end(h, goal), best)
     for f in [*ended, *others]:
         known.note(f)
 
 
 @stage("fits afresh")
-def fit_from_other_parents(h: Hypothesis, known: Known, task: Task) -> None:
+def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
     """Fit children of a hypothesis from their other parents, where those promise more.
 
     Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
     a child gains what both of its parents have gained over what these share.
     """
-    if "other parents" in task.method.without:
-        return
     evidence = known.scale.evidence
     for cause in h.causes:
-        shared = known.found.get(h.names - {cause.name})
+        shared = known.hypotheses.get(h.names - {cause.name})
         if shared is None or not shared.causes:
             continue
         gained = evidence(h) - evidence(shared) - known.scale.limits.price
         for child in known.children(h):
-            other = known.found.get(child.names - {cause.name})
+            other = known.hypotheses.get(child.names - {cause.name})
             if other is not None and evidence(other) + gained > evidence(child):
                 added = child.causes[-1].name
-                task.progress(f"cause {len(child.causes)}: {added} once more")
-                known.note(in_place(child, other, other.fit, h.fit, cause, task.experiments))
+                known.task.progress(f"cause {len(child.causes)}: {added} once more")
+                known.note(fits.in_place(child, other, other.fit, h.fit, cause))
+
+
+def fit_rivals(known: SearchState) -> None:
+    """Fit to their end the effects that may be in the place of each cause of the answer.
+
+    By their estimated evidence beside the other causes they are not clearly less likely.
+    """
+    best = known.answer
+    for cause in best.causes:
+        names = best.names - {cause.name}
+        if names not in known.hypotheses:
+            known.note(fits.without(best, cause))
+        less = known.hypotheses.get(names)
+        if less is None:
+            continue
+        view, item = known.view(less), known.scale.evidence(less)
+        top = known.scale.evidence(best) - item
+        near = top - known.task.limits.clearly * temperature(top)
+        for name, evidence in view.estimated().items():
+            if evidence > near and names | {name} not in known.hypotheses:
+                known.note(fits.with_cause(less, view.starts_of(name)))
+        larger = [h for h in known.hypotheses.values() if h.names > names]
+        children = [h for h in larger if len(h.names - names) == 1]
+        known.remember(less, *(n for h in children for n in h.names - names))
+        open_ones = [h for h in children if not h.final]
+        known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
+    known.admissible = frozenset(n for n, h in known.hypotheses.items() if known.is_admissible(h))

@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
 )
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
@@ -46,7 +46,7 @@ class Step:
     where there are later ones, and of effects that bend the same curve the best one's;
     `probability` that of being the cause, given that one effect of the table is. `chosen` is the
     hypothesis with the next cause, None of the last step; `without` the one with all causes but
-    this, `beside` what that one still shows, and `instead` the hypotheses with other effects in
+    this, `view_without` what that one leaves, and `instead` the hypotheses with other effects in
     this cause's place. `remarks` of the last step say what the search has left.
     """
 
@@ -54,7 +54,7 @@ class Step:
     fitted: Mapping[str, Hypothesis] = field(default_factory=dict)
     chosen: Hypothesis | None = None
     without: Hypothesis | None = None
-    beside: View | None = None
+    view_without: View | None = None
     instead: Mapping[str, Hypothesis] = field(default_factory=dict)
     alone: Mapping[str, float] = field(default_factory=dict)
     evidence: Mapping[str, float] = field(default_factory=dict)
@@ -89,13 +89,11 @@ class Step:
         return self.chosen.causes[-1]
 
 
-def steps_of(known: Known, task: Task) -> list[Step]:
+def steps_of(known: SearchState) -> list[Step]:
     """Return the steps to the best hypothesis; the last one is that itself."""
-    ways = [_way(known, task, k) for k in range(len(known.answer.causes))]
-    ways.append(known.answer)
-    views = [_view(known, h, task) for h in ways]
-    pairs = zip(views, [*ways[1:], None], strict=True)
-    steps = [_step(known, task, view, chosen) for view, chosen in pairs]
+    ways = [*(_way(known, k) for k in range(len(known.answer.causes))), known.answer]
+    views = [_view(known, h) for h in ways]
+    steps = [_step(known, *pair) for pair in zip(views, [*ways[1:], None], strict=True)]
     return [*steps[:-1], replace(steps[-1], remarks=known.remarks)]
 
 
@@ -105,52 +103,52 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
 
-def _way(known: Known, task: Task, count: int) -> Hypothesis:
+def _way(known: SearchState, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
     best = known.answer
-    item = known.found.get(best.names_upto(count))
+    item = known.hypotheses.get(best.names_upto(count))
     if item is not None:
         return replace(item, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
-        less = without(best, cause, task.experiments)
+        less = without(best, cause)
         best = best if less is None else less
     return best
 
 
-def _view(known: Known, h: Hypothesis, task: Task) -> View:
+def _view(known: SearchState, h: Hypothesis) -> View:
     """Look at a hypothesis; what effects would add is known from where the search began."""
     view = known.views.get(h.names)
     if view is None or view.of.fit is not h.fit:
-        known.views[h.names] = view = examine(h, task, known.trials)
+        known.views[h.names] = view = examine(h, known.task, known.trials)
     return view if view.of is h else replace(view, of=h)
 
 
-def _step(result: Known, task: Task, view: View, chosen: Hypothesis | None) -> Step:
-    fitted = _fitted(result, view.of)
+def _step(known: SearchState, view: View, chosen: Hypothesis | None) -> Step:
+    fitted, gain, task = _fitted(known, view.of), known.scale.gain, known.task
     if chosen is not None:
         fitted[chosen.causes[-1].name] = chosen
-    gain, item = result.scale.gain, result.scale.evidence(view.of)
+    evidence = known.scale.evidence(view.of)
     alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
     if chosen is None:
-        refused = {n for n, c in fitted.items() if c.names not in result.worthy}
-        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, item, task)
+        refused = {n for n, c in fitted.items() if c.names not in known.admissible}
+        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, evidence, task)
     cause = chosen.causes[-1]
-    known = result.found.get(result.answer.names - {cause.name})
-    less = known or without(result.answer, cause, task.experiments)
+    less = known.hypotheses.get(known.answer.names - {cause.name}) or without(known.answer, cause)
     if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(Step(view, fitted, chosen, alone=alone), alone, fitted, set(), item, task)
-    there = _view(result, less, task)
-    table = {**_fitted(result, less), cause.name: result.answer}
-    evidence = {**there.estimated(), **{n: gain(c, less) for n, c in table.items()}}
-    whole = result.scale.evidence(result.answer)
-    refused = {n for n, c in table.items() if c.names not in result.worthy} - {cause.name}
-    step = Step(view, fitted, chosen, less, there, table, alone)
-    return _judged(step, evidence, table, refused, whole, task)
+        return _judged(
+            Step(view, fitted, chosen, alone=alone), alone, fitted, set(), evidence, task
+        )
+    there = _view(known, less)
+    instead = {**_fitted(known, less), cause.name: known.answer}
+    beside = {**there.estimated(), **{n: gain(c, less) for n, c in instead.items()}}
+    refused = {n for n, c in instead.items() if c.names not in known.admissible} - {cause.name}
+    step = Step(view, fitted, chosen, less, there, instead, alone)
+    return _judged(step, beside, instead, refused, known.scale.evidence(known.answer), task)
 
 
-def _fitted(known: Known, h: Hypothesis) -> dict[str, Hypothesis]:
+def _fitted(known: SearchState, h: Hypothesis) -> dict[str, Hypothesis]:
     """Return the hypotheses with one more effect, by its name."""
-    every = {n: known.found.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
+    every = {n: known.hypotheses.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
     return {n: child for n, child in every.items() if child is not None}
 
 
@@ -168,11 +166,11 @@ def _judged(
 
     Effects that bend the same curve are refused together, and share what the best of them has.
     """
-    similar, good, pack = task.alike(step.fit), set(fitted) - refused, task.pack
+    similar, good, pack = task.indistinguishable(step.fit), set(fitted) - refused, task.pack
     for group in similar:
         if good & set(group):
             every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
-            like = {n for n, h, c in every if pack.in_character(h.fit, c, task.experiments)}
+            like = {n for n, h, c in every if pack.is_admissible(h.fit, c, task.experiments)}
             refused = refused - (set(group) & like)
         elif refused & set(group):
             refused = refused | set(group)
@@ -183,9 +181,7 @@ def _judged(
     return replace(step, evidence=shared, probability=chances)
 
 
-def contenders(
-    step: Step, experiments: Sequence[Experiment], limits: Thresholds, names: Sequence[str] = ()
-) -> tuple[Contender, ...]:
+def contenders(step: Step, limits: Thresholds, names: Sequence[str] = ()) -> tuple[Contender, ...]:
     """Return effects of one step of the search with their fits; those not fitted are fitted now.
 
     Without `names` they are the fewest that hold the cause with the probability `credible`. An
@@ -193,13 +189,13 @@ def contenders(
     """
     names = names or credible_set(step.probability, limits.credible)
     result = dict(step.fitted)
-    scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0), experiments)
+    scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0))
     known = dict(step.evidence)
     for name in names:
         scores = [] if name in result else step.view.starts_of(name)
-        fitted = with_cause(step.view.of, experiments, scores) if scores else None
+        fitted = with_cause(step.view.of, scores) if scores else None
         if fitted is not None:
-            result[name] = to_end(fitted, experiments)
+            result[name] = to_end(fitted)
             known[name] = scale.gain(result[name], step.view.of)
     return tuple(Contender(n, result[n].fit, known[n]) for n in names if n in result)
 
@@ -249,7 +245,7 @@ def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
     task.progress("fitting the rivals")
     step = Step(view, evidence=view.estimated())
     names = [e.name for e in task.table]
-    chosen = contenders(step, task.experiments, task.limits, names)
+    chosen = contenders(step, task.limits, names)
     lost = {*names} - {c.effect for c in chosen}
     if lost:
         raise InputError(

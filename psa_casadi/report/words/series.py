@@ -127,7 +127,7 @@ def series_of(d: Diagnosis) -> tuple[Series, ...]:
     noise = {e.output: e.noise for e in d.errors}
     rows = []
     for j in range(count):
-        base, extended = d.shown(j)
+        base, extended = d.predictions(j)
         for k, e in enumerate(d.experiments):
             curves = [Curve("base model", colours.BASE, base[k])]
             if phrases.added(d):

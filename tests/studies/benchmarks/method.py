@@ -12,7 +12,7 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
-from psa_casadi.diagnosis.search.known import Known
+from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records.split import divided
@@ -41,14 +41,14 @@ def run(progress: Progress, quick: bool) -> Outcome:
     d = psa.diagnose([record], progress=progress)
     rows = [
         {"hypothesis": _named(h), "score": f"{known.scale.score(h):.0f}",
-         "may be the answer": "yes" if h.names in known.worthy else "no"}
+         "may be the answer": "yes" if h.names in known.admissible else "no"}
         for h in _best(known)
     ]  # fmt: skip
     title = f"The search on a record with {' and '.join(map(plain, HIDDEN))}"
     return Outcome((TitledTable(title, rows),), partial(picture, known, d))
 
 
-def picture(known: Known, d: psa.StackDiagnosis) -> Figure:
+def picture(known: SearchState, d: psa.StackDiagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
     figure = Figure(figsize=(12.0, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
@@ -57,10 +57,11 @@ def picture(known: Known, d: psa.StackDiagnosis) -> Figure:
     return figure
 
 
-def _scores(axes: Axes, known: Known) -> None:
+def _scores(axes: Axes, known: SearchState) -> None:
     rows = _best(known)[::-1]
     colours = [
-        _BLUE if h is known.answer else _ORANGE if h.names in known.worthy else _GREY for h in rows
+        _BLUE if h is known.answer else _ORANGE if h.names in known.admissible else _GREY
+        for h in rows
     ]
     scores = [max(known.scale.score(h), 0.0) for h in rows]
     axes.barh([_named(h) for h in rows], scores, color=colours)
@@ -88,8 +89,8 @@ def _shares(axes: Axes, d: psa.StackDiagnosis) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _best(known: Known) -> Sequence[Hypothesis]:
-    return sorted(known.found.values(), key=lambda h: -known.scale.score(h))[:_SHOWN]
+def _best(known: SearchState) -> Sequence[Hypothesis]:
+    return sorted(known.hypotheses.values(), key=lambda h: -known.scale.score(h))[:_SHOWN]
 
 
 def _named(h: Hypothesis) -> str:

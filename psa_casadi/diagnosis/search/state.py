@@ -7,12 +7,11 @@ import numpy as np
 
 from psa_casadi.component import Component
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.pack import Task
-from psa_casadi.diagnosis.search.fits import as_led, begun_again, cost_beside, to_end
+from psa_casadi.diagnosis.pack import Task, is_dynamic
+from psa_casadi.diagnosis.search.fits import as_led, cost_beside, refit_at_bound, to_end
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
-    another_minimum,
     examine,
     held_out_confirms,
     hypothesis,
@@ -22,6 +21,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
 )
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.refitting import relevelled
 from psa_casadi.notes import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 
@@ -30,6 +30,8 @@ from psa_casadi.simulation.side_by_side import side_by_side
 SHARE, NEAR = 0.8, 30.0
 #: So many fits of neighbours go to their end.
 FINALISTS = 3
+#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
+_SAME = 1.0
 #: Effects far behind in the screening are fitted afresh where less than this share of the excess
 #: power is explained.
 _EXPLAINED = 0.8
@@ -38,17 +40,17 @@ Names = frozenset[str]
 NONE: Names = frozenset()
 
 
-class Known:
+class SearchState:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
-    `found` holds them by their causes, `views` those whose residual was looked at, `fitted` the
+    `hypotheses` holds them by their causes, `views` those whose residual was tested, `fitted` the
     effects fitted beside each, `trials` what effects would add to the base. A search that has ended
-    has an `answer`, and the causes of all that is worth having (`worthy`); `remarks` say what it
-    has left.
+    has an `answer`, and the causes of all `admissible` hypotheses; `remarks` say which steps it has
+    left out.
     """
 
     answer: Hypothesis
-    worthy: frozenset[Names]
+    admissible: frozenset[Names]
     remarks: tuple[Note, ...] = ()
 
     def __init__(self, base: Fit, task: Task) -> None:
@@ -56,44 +58,45 @@ class Known:
         root = root_of(base, task)
         first = examine(root, task)
         self.trials = first.trials
-        item = scale_of(root, first.screening.colour, task.limits, task.experiments)
-        self.scale = replace(item, held=()) if "held out" in task.method.without else item
-        self.found: dict[Names, Hypothesis] = {root.names: root}
+        self.scale = scale_of(root, first.screening.colour, task.limits)
+        if "held out" in task.method.without:
+            self.scale = replace(self.scale, held=())
+        self.hypotheses: dict[Names, Hypothesis] = {root.names: root}
         self.views: dict[Names, View] = {root.names: first}
         self.fitted: dict[Names, tuple[str, ...]] = {}
         self.memories: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.noises: dict[tuple[Hypothesis, Hypothesis], bool] = {}
         self.entered: dict[Hypothesis, Hypothesis] = {}
-        self.tell(root, "finished")
+        self.notify(root, "finished")
 
     @property
     def root(self) -> Hypothesis:
         """The base without causes, as it is fitted by now."""
-        return self.found[NONE]
+        return self.hypotheses[NONE]
 
     def conclude(self) -> None:
         """End the search: choose the answer, look at it, and ask what else is worth having."""
         self.view(self.best())
         self.answer = self.in_order(self.best())
         self.view(self.answer)
-        self.tell(self.answer, "best")
-        self.worthy = frozenset(n for n, h in self.found.items() if self.worth(h))
+        self.notify(self.answer, "best")
+        self.admissible = frozenset(n for n, h in self.hypotheses.items() if self.is_admissible(h))
 
     def in_order(self, h: Hypothesis) -> Hypothesis:
         """Return a hypothesis with its causes in the order in which they explain most.
 
         Those that bend the same curve as another effect, which are never named alone, come last.
         """
-        shared = {n for group in self.task.alike(self.root.fit) for n in group}
+        shared = {n for group in self.task.indistinguishable(self.root.fit) for n in group}
         left: list[Component] = list(h.causes)
         causes: list[Component] = []
         while left:
             names = frozenset(c.name for c in causes)
-            known = [self.found.get(names | {c.name}) for c in left]
+            known = [self.hypotheses.get(names | {c.name}) for c in left]
             gains = [-np.inf if k is None else self.scale.evidence(k) for k in known]
-            items = [c.name not in shared for c in left]
-            causes.append(left.pop(max(range(len(left)), key=lambda k: (items[k], gains[k]))))
-        self.found[h.names] = ordered = replace(h, causes=tuple(causes))
+            ranks = [(c.name not in shared, g) for c, g in zip(left, gains, strict=True)]
+            causes.append(left.pop(ranks.index(max(ranks))))
+        self.hypotheses[h.names] = ordered = replace(h, causes=tuple(causes))
         return ordered
 
     def note(self, found: Hypothesis | None) -> None:
@@ -103,19 +106,16 @@ class Known:
         """
         if found is None:
             return
-        old = self.found.get(found.names)
-        if old is None or self.replaces(found, old):
+        old, evidence = self.hypotheses.get(found.names), self.scale.evidence
+        gained = np.inf if old is None else evidence(found) - evidence(old)
+        ahead = 0.0 if old is None else self.scale.held_out(found, old)
+        if gained > _SAME and gained + ahead > 0.0:
             causes = found.causes if old is None else old.causes
             kept = replace(found, causes=causes)
-            self.found[found.names] = kept if causes else noisy(kept, self.task)
-            self.tell(kept, "finished" if kept.final else "fitted")
+            self.hypotheses[found.names] = kept if causes else noisy(kept, self.task)
+            self.notify(kept, "finished" if kept.final else "fitted")
 
-    def replaces(self, result: Hypothesis, old: Hypothesis) -> bool:
-        """Whether a fit of the same causes takes another one's place."""
-        gained = self.scale.evidence(result) - self.scale.evidence(old)
-        return another_minimum(gained, self.scale.held_out(result, old))
-
-    def tell(self, h: Hypothesis, state: State) -> None:
+    def notify(self, h: Hypothesis, state: State) -> None:
         """Tell whoever watches the search of a hypothesis."""
         self.task.watch(
             Tried(
@@ -124,8 +124,8 @@ class Known:
                 evidence=float(self.scale.evidence(h)),
                 score=float(self.scale.score(h)),
                 rms_m=float(h.fit.rms),
-                holdout_rms_m=float(h.holdout_rms),
-                base_rms_m=float(self.root.holdout_rms),
+                holdout_rms_m=float(h.held[0]),
+                base_rms_m=float(self.root.held[0]),
                 noise_rms_m=float(self.scale.colour.rms),
             )
         )
@@ -142,18 +142,17 @@ class Known:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted beside one, best first."""
-        items = [self.found.get(h.names | {n}) for n in self.fitted.get(h.names, ())]
-        item = []
-        for child in items:
-            if child is not None:
+        children = []
+        for name in self.fitted.get(h.names, ()):
+            if (child := self.hypotheses.get(h.names | {name})) is not None:
                 added = [c for c in child.causes if c.name not in h.names]
-                item.append(replace(child, causes=(*h.causes, *added)))
-        return sorted(item, key=lambda c: -self.scale.evidence(c))
+                children.append(replace(child, causes=(*h.causes, *added)))
+        return sorted(children, key=lambda c: -self.scale.evidence(c))
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
-        item, children = self.scale.evidence(h), self.children(h)
-        gains = [self.scale.evidence(c) - item for c in children]
+        evidence, children = self.scale.evidence(h), self.children(h)
+        gains = [self.scale.evidence(c) - evidence for c in children]
         least = nearly(gains[0]) if gains else 0.0
         return [c for c, gained in zip(children, gains, strict=True) if gained > least]
 
@@ -162,7 +161,7 @@ class Known:
 
         Its evidence beside `h` would be below `SHARE` of that one's, and by `NEAR` nats.
         """
-        count, reached = len(h.fit.residuals), cost_beside(best.fit, h.fit, self.task.experiments)
+        count, reached = len(h.fit.residuals), cost_beside(best, h)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
         return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
@@ -172,12 +171,12 @@ class Known:
 
     def ranked(self) -> list[Hypothesis]:
         """Return all hypotheses, that of the highest score first."""
-        return sorted(self.found.values(), key=lambda h: -self.scale.score(h))
+        return sorted(self.hypotheses.values(), key=lambda h: -self.scale.score(h))
 
     def best(self) -> Hypothesis:
         """Return the answer so far: of the highest score and worth having, fitted to its end."""
         while True:
-            top = next(h for h in self.ranked() if self.worth(h))
+            top = next(h for h in self.ranked() if self.is_admissible(h))
             if top.final:
                 return top
             self.finish([top])
@@ -186,11 +185,7 @@ class Known:
         """Return what would be better than the answer if held-out samples confirmed it."""
         best, fitted = self.best(), self.scale.of_fitted
         better = [h for h in self.ranked() if fitted(h) > fitted(best)]
-        return [h for h in better if self.worth(h, confirmed=False)]
-
-    def so_far(self) -> Hypothesis:
-        """Return the best of what was fitted to its end, whether worth having or not."""
-        return next(h for h in self.ranked() if h.final)
+        return [h for h in better if self.is_admissible(h, confirmed=False)]
 
     def finish(self, hypotheses: Sequence[Hypothesis]) -> None:
         """Fit hypotheses to their end."""
@@ -198,48 +193,47 @@ class Known:
             names = ", ".join("+".join(sorted(h.names)) for h in hypotheses)
             self.task.progress(f"{names} to the end")
         for ended in side_by_side(self._to_end, hypotheses):
-            old = self.found[ended.names]
+            old = self.hypotheses[ended.names]
             better = self.scale.evidence(ended) >= self.scale.evidence(old)
-            self.found[ended.names] = kept = ended if better else replace(old, final=True)
-            self.tell(kept, "finished")
+            self.hypotheses[ended.names] = kept = ended if better else replace(old, final=True)
+            self.notify(kept, "finished")
         if "begun again" in self.task.method.without:
             return
-        final = [self.found[h.names] for h in hypotheses]
-        for again in side_by_side(lambda h: begun_again(h, self.task.experiments), final):
+        final = [self.hypotheses[h.names] for h in hypotheses]
+        for again in side_by_side(refit_at_bound, final):
             self.note(again)
 
     def _to_end(self, h: Hypothesis) -> Hypothesis:
         """Fit a hypothesis to its end, with the noise that it leaves."""
-        experiments, ended = self.task.experiments, to_end(h, self.task.experiments)
-        levelled = self.task.pack.ended(ended.fit, experiments)
+        ended = to_end(h)
+        if self.task.pack.is_stack:
+            return ended
+        levelled, _ = relevelled(ended.fit, h.experiments, every=True)
         if levelled is ended.fit:
             return ended
-        return hypothesis(ended.causes, levelled, experiments, final=True) or ended
+        return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
 
-    def worth(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
+    def is_admissible(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
 
         Each has its parameters inside their ranges and removes what can be told, more than the
         `form` of the others may miss. A memory adds more than a static curve, each more than noise
         of another colour, and held-out samples have `confirmed` it.
         """
-        return all(self._worth(h, c, confirmed=confirmed, form=form) for c in h.causes)
+        return all(self._may_hold(h, c, confirmed=confirmed, form=form) for c in h.causes)
 
-    def _worth(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
-        experiments, out, pack = self.task.experiments, self.task.method.without, self.task.pack
-        if not pack.in_character(h.fit, cause, experiments):
+    def _may_hold(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
+        out, pack = self.task.method.without, self.task.pack
+        if not pack.is_admissible(h.fit, cause, h.experiments):
             return False
-        before = self.found.get(h.names - {cause.name})
+        before = self.hypotheses.get(h.names - {cause.name})
+        least = self.views[NONE].test.detection_limit
         return before is None or (
-            pack.told(h.fit, before.fit, h.removes(before), self.views[NONE].test.knowable)
-            and not (form and "form" not in out and self.little(h, before))
+            pack.exceeds_detection_limit(h.fit, before.fit, h.removes(before), least)
+            and not (form and "form" not in out and self.is_small(h, before))
             and self.remembers(h, before, cause)
             and ("noise" in out or self.beyond_noise(h, before, cause))
-            and (
-                not confirmed
-                or "held out" in out
-                or held_out_confirms(h, before, experiments, self.scale)
-            )
+            and (not confirmed or "held out" in out or held_out_confirms(h, before, self.scale))
         )
 
     def beyond_noise(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
@@ -250,8 +244,8 @@ class Known:
         """
         if (h, before) not in self.noises:
             result = self.exceeds(h, before)
-            if result and before.own[0].autoregression.size:
-                led = as_led(h, cause, self.task.experiments)
+            if result and before.colours[0].autoregression.size:
+                led = as_led(h, cause)
                 result = led is None or self.exceeds(h, led)
             self.noises[h, before] = result
         return self.noises[h, before]
@@ -264,7 +258,7 @@ class Known:
         least, held = self.task.limits.price, self.scale.held
         if h.beyond_noise(before, held, least) > least:
             return True
-        entered = any(c.entering for c in before.own)
+        entered = any(c.entering for c in before.colours)
         return entered and self.noisy(h).beyond_noise(before, held, least) > least
 
     def noisy(self, h: Hypothesis) -> Hypothesis:
@@ -273,7 +267,7 @@ class Known:
             self.entered[h] = noisy(h, self.task)
         return self.entered[h]
 
-    def little(self, h: Hypothesis, before: Hypothesis) -> bool:
+    def is_small(self, h: Hypothesis, before: Hypothesis) -> bool:
         """Whether a further cause removes no more than the form of the others may miss.
 
         What it removes of all that these remove is small then, and it leaves much of what they do.
@@ -282,31 +276,27 @@ class Known:
         few = h.share(before, self.root) <= limits.further
         return bool(before.causes) and few and h.leaves(before) > 1.0 - limits.enough
 
-    def slight(self, h: Hypothesis) -> tuple[str, ...]:
+    def small_causes(self, h: Hypothesis) -> tuple[str, ...]:
         """Name the causes that remove too little beside the others to be told from their form."""
-        less = {c.name: self.found.get(h.names - {c.name}) for c in h.causes}
-        return tuple(n for n, b in less.items() if b is not None and self.little(h, b))
+        less = {c.name: self.hypotheses.get(h.names - {c.name}) for c in h.causes}
+        return tuple(n for n, b in less.items() if b is not None and self.is_small(h, b))
 
     def remembers(self, h: Hypothesis, before: Hypothesis, cause: Component) -> bool:
         """Whether a cause with a memory that stays adds more than a static curve."""
-        if not any(s.memory and not s.settles for s in cause.states):
+        stays = any(s.memory and not s.settles for s in cause.states)
+        if not (stays and self.task.pack.is_stack):
             return True
         if (h, before) not in self.memories:
             added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
-            self.memories[h, before] = self.task.pack.remembers(
-                added, before.fit, self.task.experiments, self.task.limits
-            )
+            dynamic = is_dynamic(added, before.fit, h.experiments, self.task.limits)
+            self.memories[h, before] = dynamic
         return self.memories[h, before]
-
-    def gained(self, before: Hypothesis, after: Hypothesis) -> bool:
-        """Whether a fit has more evidence than an earlier one by the price of a cause."""
-        return self.scale.evidence(after) > self.scale.evidence(before) + self.scale.limits.price
 
     def different(self, effect: Component, h: Hypothesis) -> bool:
         """Whether an effect is none of the causes, nor bends the same curve as one of them."""
         if effect.name in {c.more_of for c in h.causes}:
             return False
-        groups = self.task.alike(self.root.fit)
+        groups = self.task.indistinguishable(self.root.fit)
         return not any(effect.name in g and h.names & set(g) for g in groups)
 
     def is_open(self, h: Hypothesis) -> bool:
