@@ -368,7 +368,7 @@ def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str],
     """
     doubts.refuse_unreadable(records)
     pairs = [(r, suspects(r)) for r in records]
-    clean = [masked(r, s) for r, s in pairs]
+    clean = [cleaned(r, s) for r, s in pairs]
     saturation = tuple(n for r, s in pairs for n in s.saturation(r.name))
     doubts.refuse_few(records, clean, texts(saturation))
     saturated = sum(s.counts["saturated"] for _, s in pairs)
