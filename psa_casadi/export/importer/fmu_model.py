@@ -61,8 +61,7 @@ def read_variables(
     arrays.
     """
     problems = Problems()
-    table = {v.name: v for v in fmu.description.modelVariables}
-    rows = {n: table[e.variable] for n, e in fmu.elements.items()}
+    rows = {n: fmu.variables[e.variable] for n, e in fmu.elements.items()}
     inputs, outputs = (
         {n: v for n, v in rows.items() if v.causality == causality and n not in values}
         for causality in ("input", "output")
@@ -86,7 +85,7 @@ def read_variables(
         _parameter(n, fmu, rows[n], arguments, values, problems) for n, arguments in wanted.items()
     ]
     problems.raise_if_any()
-    states = [] if whole else [table[n] for n in fmu.states()]
+    states = [] if whole else [fmu.variables[n] for n in fmu.states()]
     taken = [*inputs, *outputs]
     nominals = fmu.nominals
     read = Read(
@@ -286,7 +285,7 @@ def fmu_model(
     chosen = None if interface is None else _interface(fmu, interface)
     if chosen != CO_SIMULATION and _has_equations(fmu):
         with suppress(_TimeEventError):
-            return _of_equations(fmu, file, digest, free, values or {}, name)
+            return _of_equations(fmu, digest, free, values or {}, name)
     chosen = _interface(fmu, None) if chosen is None else chosen
     read = read_variables(fmu, free, values or {}, whole=True)
     s, names = read.selected, (p.name for p in read.parameters)
@@ -339,9 +338,8 @@ class _TimeEventError(Exception):
 
 
 def _of_equations(
-    fmu: Fmu, file: Path, digest: str, free: Free | None, values: Mapping[str, float],
-    name: str | None,
-) -> Model:  # fmt: skip
+    fmu: Fmu, digest: str, free: Free | None, values: Mapping[str, float], name: str | None
+) -> Model:
     """Return the model of an FMU whose equations are evaluated."""
     read = read_variables(fmu, free, values)
     imported = imported_of(fmu, digest, read.selected, _sizes(read))

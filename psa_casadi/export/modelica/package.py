@@ -144,7 +144,7 @@ def _experiment(span: float) -> str:
     return f"experiment({times}, Tolerance=1e-8)"
 
 
-def _kept(model: Model, names: Mapping[str, str], inputs: Iterable[Input]) -> list[str]:
+def _kept(names: Mapping[str, str], inputs: Iterable[Input]) -> list[str]:
     """Return what holds inputs at their start values."""
     return [f"{names[i.name]}={number(i.start, i.name)}" for i in inputs]
 
@@ -161,7 +161,7 @@ def _sine(model: Model) -> dict[str, str]:
         "unit": string(unit_text(first.unit)),
         "height": size_text(nominal_value(first.nominal, model.values), first.name),
         "frequency": repr(float(f"{4 / _span(model):.2g}")),
-        "inputs": ", ".join([f"{names[first.name]}={swing}", *_kept(model, names, others)]),
+        "inputs": ", ".join([f"{names[first.name]}={swing}", *_kept(names, others)]),
     }
 
 
@@ -188,7 +188,7 @@ def _wired(model: Model) -> dict[str, str]:
     return {
         "swing": repr(swing),
         "frequency": repr(float(f"{4 / span:.2g}")),
-        "kept": ", ".join(_kept(model, names, free)),
+        "kept": ", ".join(_kept(names, free)),
         "experiment": _experiment(span),
         **{name: repr(float(f"{value:.3g}")) for name, value in loads.items()},
     }
