@@ -38,12 +38,12 @@ class Processes:
         self._held.close()
 
     def _called(self, function: Callable[[Any], Any], argument: Any) -> Any:
-        if not hasattr(self._own, "child"):  # the process of this thread
+        child = cast("Child | None", getattr(self._own, "child", None))
+        if child is None or child.poll() is not None:  # the process of this thread
             started = started_python("psa_casadi.processes", directory=None, **_OURS)
-            self._own.child = self._held.enter_context(started)
+            self._own.child = child = self._held.enter_context(started)
             if self._ended:
-                kill(self._own.child)
-        child = cast("Child", self._own.child)
+                kill(child)
         try:
             pickle.dump((function, argument), cast("IO[bytes]", child.stdin))
             cast("IO[bytes]", child.stdin).flush()
