@@ -52,8 +52,7 @@ def mechanism(
     Example:
         psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json
     """
-    from psa_casadi.design.mechanism.mechanism import check_goals
-    from psa_casadi.design.mechanism.search import Limits
+    from psa_casadi.design.mechanism.mechanism import Limits, check_goals
     from psa_casadi.report.page.designs import write_mechanism_page
     from psa_casadi.report.words.design_words import (
         mechanism_sentences,

@@ -1,10 +1,11 @@
 """Public datasets: what is published under which licence, and how a record is made of it."""
 
 import io
+import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +17,8 @@ def _beside(name: str) -> str:
     return files("psa_casadi.datasets").joinpath(name).read_text(encoding="utf-8")
 
 
+#: Addresses, sources, citations, licences and descriptions.
+_PUBLISHED: dict[str, Any] = tomllib.loads(_beside("published.toml"))
 #: The SHA-256 of every file, published or made of what is published, by its name.
 _SHA256 = {name: sha for sha, name in map(str.split, _beside("published.sha256").splitlines())}
 
@@ -176,77 +179,21 @@ class Dataset:
         return {o.name: o for file in self.files for o in file.originals}
 
 
-def _originals(folder: str, *names: str) -> tuple[Original, ...]:
-    return tuple(Original(name, f"{folder}{name}", _SHA256[name]) for name in names)
-
-
 def _file(
-    name: str, description: str, originals: tuple[Original, ...], conversion: Columns | OneAxis
-) -> DatasetFile:
-    return DatasetFile(name, description, _SHA256[name], originals, conversion)
+    name: str, description: str, device: str, originals: Sequence[str],
+    conversion: Columns | OneAxis,
+) -> DatasetFile:  # fmt: skip
+    folder = _PUBLISHED["folders"][device]
+    files = tuple(Original(o, f"{folder}{o}", _SHA256[o]) for o in originals)
+    return DatasetFile(name, description, _SHA256[name], files, conversion)
 
 
-_FOLDER = (
-    "https://raw.githubusercontent.com/yan9a/DiscreteBacklashOperator/"
-    "79fd060d86cdf69be2388e29bf57b0766c273650/MatLabCode/DiscreteBacklashModel/"
-)
-_TEST = _originals(_FOLDER, "Test_Vi_Do_Di.dat")
+def _taken(name: str, part: dict[str, Any]) -> DatasetFile:
+    """Return the record of columns of a table that `published.toml` names."""
+    columns = Columns(part["first_row"], part["rows"], 0, 4, sample_rate=200.0)
+    return _file(name, part["description"], "micromanipulator", [part["original"]], columns)
 
 
-def _taken(first_row: int, rows: int) -> Columns:
-    return Columns(first_row, rows, voltage=0, displacement=4, sample_rate=200.0)
-
-
-_micromanipulator = partial(
-    Dataset,
-    source="https://github.com/yan9a/DiscreteBacklashOperator",
-    citation="Y. N. Aye and W. T. Ang, A Discrete Backlash Operator for Identification and"
-    " Compensation of Hysteresis and Non-linearity for Piezoelectric Micromanipulator, ICSTSD 2018",
-    licence="MIT, copyright (c) 2019 Yan Naing Aye",
-    licence_text=_beside("micromanipulator_licence.txt"),
-)
-
-MICROMANIPULATOR = _micromanipulator(
-    name="micromanipulator",
-    description="piezo-driven flexure, open loop, 200 Hz, amplifier input 0 to 3.6 V, capacitive"
-    " sensor with 0.07 um rms noise; the displacement's zero is arbitrary",
-    files=(
-        _file(
-            "sine_1hz.csv",
-            "full-range sine, 1 Hz, 39 cycles",
-            _originals(_FOLDER, "Model_Vi_Do.dat"),
-            _taken(100, 7927),
-        ),
-        _file(
-            "minor_loops.csv",
-            "1 Hz sine of ramped amplitude: nested minor loops",
-            _TEST,
-            _taken(100, 3600),
-        ),
-    ),
-)
-
-MICROMANIPULATOR_RESTS = _micromanipulator(
-    name="micromanipulator_rests",
-    description="the same micromanipulator: what follows its minor loops in the same file; the"
-    " voltage of the loops was corrected beforehand so that the displacement is a sine, and is none"
-    " itself",
-    files=(
-        _file(
-            "groups_and_rests.csv",
-            "a rest of 6.0 s, loops of 1 Hz that grow and shrink, a rest of 4.6 s, loops that grow",
-            _TEST,
-            _taken(3700, 10455),
-        ),
-    ),
-)
-
-
-_MIRROR_FOLDER = (
-    "https://raw.githubusercontent.com/merijnfloren/fsm-benchmark-data/"
-    "539a12fef384b086a8562b500498b2fa3899ef70/data/"
-)
-_RATE = 6400.0
 LEVELS = (100, 200, 300)
 #: Displacements 1 and 2 are measured against the direction of their actuators.
 SIGNS = (-1, -1, 1)
@@ -256,42 +203,32 @@ def _axis(axis: int, level: int, signal: int | None = None) -> DatasetFile:
     """Return the record of one axis: of the first training signal, or of a test signal."""
     name = f"axis_{axis + 1}_{level}mV{'' if signal is None else f'_test_{signal + 1}'}.csv"
     parts = ("train",) if signal is None else ("train", "test")
-    originals = [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"]
     which = "first training signal" if signal is None else f"test signal {signal + 1}"
     length = "one period" if signal is None else "two periods"
     return _file(
         name,
         f"axis {axis + 1} and its own actuator, {which}, {level} mV rms, {length}",
-        _originals(_MIRROR_FOLDER, *originals),
-        OneAxis(axis, SIGNS[axis], signal or 0, len(parts), _RATE),
+        "steering_mirror",
+        [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"],
+        OneAxis(axis, SIGNS[axis], signal or 0, len(parts), sample_rate=6400.0),
     )
 
 
-_mirror = partial(
-    Dataset,
-    source="https://github.com/merijnfloren/fsm-benchmark-data",
-    citation="M. Floren, L. Peri, J. De Maeyer, W. De Munter, D. Vandepitte and J.-P. Noel,"
-    " Data-driven state-space identification and nonlinearity assessment of the CubeSpec Fine"
-    " Steering Mirror, ISMA-USD 2024, 2042-2052",
-    licence="CC BY 4.0, copyright (c) 2025 Merijn Floren, KU Leuven",
-    licence_text=_beside("steering_mirror_licence.txt"),
-)
-
-STEERING_MIRROR = _mirror(
-    name="steering_mirror",
-    description="a satellite's mirror on three piezo actuators, each axis with its own one:"
-    " random-phase multisines up to 3 kHz, 6.4 kHz, steady state, three levels",
-    files=tuple(_axis(axis, level) for level in LEVELS for axis in range(3)),
-)
-
-STEERING_MIRROR_TEST = _mirror(
-    name="steering_mirror_test",
-    description="the same mirror: the test signals of the benchmark, to judge a model by",
-    files=tuple(_axis(a, level, k) for level in LEVELS for a in range(3) for k in range(3)),
-)
+def _files(name: str) -> tuple[DatasetFile, ...]:
+    if name == "steering_mirror":
+        return tuple(_axis(a, level) for level in LEVELS for a in range(3))
+    if name == "steering_mirror_test":
+        return tuple(_axis(a, level, k) for level in LEVELS for a in range(3) for k in range(3))
+    return tuple(_taken(n, part) for n, part in _PUBLISHED["columns"][name].items())
 
 
-_ALL = (MICROMANIPULATOR, MICROMANIPULATOR_RESTS, STEERING_MIRROR, STEERING_MIRROR_TEST)
+def _dataset(name: str, device: str, description: str) -> Dataset:
+    licence = _beside(f"{device}_licence.txt")
+    texts = _PUBLISHED["devices"][device]
+    return Dataset(name, description, **texts, licence_text=licence, files=_files(name))
 
-DATASETS: dict[str, Dataset] = {d.name: d for d in _ALL}
+
+DATASETS: dict[str, Dataset] = {
+    name: _dataset(name, **words) for name, words in _PUBLISHED["datasets"].items()
+}
 """Every dataset by name. A dataset is listed once its licence and its hashes were verified."""

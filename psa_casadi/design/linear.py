@@ -121,16 +121,12 @@ class Linear(Celled):
         if target.suffix.lower() == ".json":
             atomic_write(target, json_text(self.to_json()))
         elif target.suffix.lower() == ".mat":
-            names = {"x_name": self.state_names, "u_name": self.input_names}
-            cells = {n: np.array(v, dtype=object) for n, v in names.items()}
-            cells["y_name"] = np.array(self.output_names, dtype=object)
-            points = {"x0": self.x, "u0": self.u, "y0": self.y}
-            matrices = {n: getattr(self, n.lower()) for n in "ABCD"}
+            names = {"x": self.state_names, "u": self.input_names, "y": self.output_names}
+            content: dict[str, Any] = {n: getattr(self, n.lower()) for n in "ABCD"}
+            content |= {"x0": self.x, "u0": self.u, "y0": self.y}
+            content |= {f"{k}_name": np.array(v, dtype=object) for k, v in names.items()}
             with atomic_path(target) as temporary:
-                scipy.io.savemat(
-                    str(temporary), {**matrices, **points, **cells}, appendmat=False,
-                    oned_as="column",
-                )  # fmt: skip
+                scipy.io.savemat(str(temporary), content, appendmat=False, oned_as="column")
         else:
             raise InputError(f"{target}: matrices go to NAME.mat or NAME.json; name it so.")
 
@@ -150,7 +146,7 @@ def linearize(
     derivatives; one that is run as a whole has none.
 
     Raises InputError for unknown names, sampled states, an FMU that is run as a whole, and where no
-    rest is found.
+    rest exists.
     """
     s, arguments = model.structure, dict(inputs or {})
     known = {"input": model.input_names, "state": model.state_names}

@@ -26,8 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from psa_casadi.component import Component
-from psa_casadi.devices.device import make_ready
-from psa_casadi.devices.executors import Executor, outcomes
+from psa_casadi.devices.executors import Executor, make_ready, outcomes
 from psa_casadi.devices.jobs import (
     DeviceOutcome,
     DeviceTask,

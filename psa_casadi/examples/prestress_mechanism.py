@@ -16,13 +16,13 @@ from matplotlib.figure import Figure
 import psa_casadi as psa
 from psa_casadi.design.mechanism.loop import Mounting, step_response
 from psa_casadi.design.mechanism.mechanism import (
+    Limits,
     MechanismDesign,
     design_mechanism,
     mechanism_model,
     port_model,
     root_locus,
 )
-from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.examples.co_simulation import Slave
 from psa_casadi.units import FloatArray
 

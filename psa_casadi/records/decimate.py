@@ -38,7 +38,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
 
     A block's displacement is the mean of its valid samples, brought to the block's middle along the
     line to its neighbour; a block of which more than half is missing is masked, and where samples
-    are missing, q stands for the valid ones of the emptiest block. Fewer than q samples at the end
+    are missing, q means the valid ones of the emptiest block. Fewer than q samples at the end
     are dropped. Name, source and `sha256` are kept.
 
     Raises:
@@ -62,7 +62,7 @@ def decimated(record: Record, noise: float, slope: float) -> tuple[Record, int]:
         if record.displacement is not None:
             columns["displacement"] = _valid_means(record, time, q)
         wider = replace(record, time=time, **columns)
-        if not _nothing_lost(record, wider, q, noise, SHARE * noise / abs(slope)):
+        if not _is_lossless(record, wider, q, noise, SHARE * noise / abs(slope)):
             break
         best, factor = wider, q
     return best, factor
@@ -88,13 +88,13 @@ def _valid_means(record: Record, time: FloatArray, q: int) -> FloatArray:
     return means
 
 
-def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: float) -> bool:
+def _is_lossless(record: Record, wider: Record, q: int, noise: float, allowed: float) -> bool:
     """Whether block averages over q samples keep voltage, load and displacement."""
-    if not _followed(record, wider, record.voltage, wider.voltage, q, allowed):
+    if not _is_followed(record, wider, record.voltage, wider.voltage, q, allowed):
         return False
     if record.load_force is not None and wider.load_force is not None:
         least = 1e-3 * float(np.ptp(record.load_force)) + 1e-300
-        if not _followed(record, wider, record.load_force, wider.load_force, q, least):
+        if not _is_followed(record, wider, record.load_force, wider.load_force, q, least):
             return False
     y, means = record.displacement, wider.displacement
     if y is None or means is None:
@@ -106,10 +106,10 @@ def _nothing_lost(record: Record, wider: Record, q: int, noise: float, allowed: 
     known = wider.mask
     taken = np.nan_to_num(y) - _lines(record.time, wider.time[known], means[known])
     white = np.where(record.mask, taken, 0.0)
-    return _straight(means, noise / np.sqrt(least)) and _is_white(white, q)
+    return _is_straight(means, noise / np.sqrt(least)) and _is_white(white, q)
 
 
-def _followed(
+def _is_followed(
     record: Record, wider: Record, signal: FloatArray, means: FloatArray, q: int, allowed: float
 ) -> bool:
     """Whether straight lines between the means meet the signal, but for its white noise."""
@@ -131,7 +131,7 @@ def _lines(time: FloatArray, centres: FloatArray, means: FloatArray) -> FloatArr
     return values
 
 
-def _straight(means: FloatArray, noise: float) -> bool:
+def _is_straight(means: FloatArray, noise: float) -> bool:
     """Whether averaging moved no mean by more than a tenth of its noise.
 
     A bend of the means, y'' h^2, is 24 times that. Over five means the noise of a bend is 0.4 of

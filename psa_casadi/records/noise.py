@@ -262,7 +262,7 @@ def uncertain(residual: FloatArray) -> float:
     """Return the relative standard error of the noise's power from a residual's fast part.
 
     About 2/sqrt(n) of white noise. The power of a first-order autoregression hangs on what its fast
-    part tells of the correlation r: 1.4 q/sqrt(n) with q = (1 + r)/(1 - r), within a fifth of what
+    part shows of the correlation r: 1.4 q/sqrt(n) with q = (1 + r)/(1 - r), within a fifth of what
     60 draws each of r = 0.4 to 0.9 and n = 2,000 to 5,000 showed; at most 1.
     """
     r = first_order_noise(residual)[1] if residual.size else 0.0

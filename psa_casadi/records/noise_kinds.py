@@ -25,21 +25,19 @@ from psa_casadi.records.noise import (
     local_scale,
     quantum_of,
 )
-from psa_casadi.records.noise_parts import (
-    Jumps,
-    columns_of,
-    followed,
-    jumps_in,
-    period_of,
-    returning,
-)
-from psa_casadi.records.noise_spectra import (
+from psa_casadi.records.noise_models import (
     LEAST,
     WHITE,
     Colour,
+    Jumps,
     centre_of,
     colour_of,
+    columns_of,
+    followed,
+    jumps_in,
     line_spectrum,
+    period_of,
+    returning,
     score,
     tones_in,
 )
@@ -356,11 +354,8 @@ class _Residual:
             jitter, grows = (_grown(z, x) for x in (rate, self.predicted[self.index]))
             gain, size, deviation = best = max(jitter, grows, key=lambda g: g[0])
             if gain > LEAST:
-                kinds.append(
-                    NoiseKind("jitter", {"rms": size * scale})
-                    if best is jitter
-                    else NoiseKind("grows", {"share": size * scale})
-                )
+                kind: Kind = "jitter" if best is jitter else "grows"
+                kinds.append(NoiseKind(kind, {"rms" if best is jitter else "share": size * scale}))
                 z = z / deviation
             tails = _tails(z)
         gain, where = _outliers(z)

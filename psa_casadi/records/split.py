@@ -162,14 +162,13 @@ _SHOWN = 0.05
 
 @dataclass(frozen=True)
 class Channel:
-    """A column of the records that is fitted, and what of a model it shows.
+    """A column of the records that is fitted, and the outputs of the model that it shows.
 
-    `outputs` are those of the model, in the column's `unit`. With an `offset`, every record has its
-    own; with `factors`, every output has one, the same in all records, and the first factor is that
-    of `scale`, a parameter of the sensor, where there is one. `level` is the noise level that
-    weights it; the model is assumed right to the share `straight` of the readings (of their rms
-    about the offsets; of the range where there are no factors): a smaller error is no sign of a
-    defect.
+    `outputs` are in the column's `unit`. With an `offset`, every record has one; with `factors`,
+    every output has one, the same in all records, and the first factor is that of `scale`, a
+    parameter of the sensor, where there is one. `level` is the noise level that weights it; the
+    model is assumed right to the share `straight` of the readings (of their rms about the offsets;
+    of the range where there are no factors): a smaller error is no sign of a defect.
     """
 
     column: str

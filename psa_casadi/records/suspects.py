@@ -48,8 +48,8 @@ def spikes_in(
 ) -> BoolArray:
     """Return which samples of an output (n,), nan where there is none, are spikes.
 
-    `inputs` (n, nu) are known throughout. A spike has at most `longest` samples and stands out by
-    `limit` standard deviations of the residual around it and by `smallest`, in the output's unit.
+    `inputs` (n, nu) are known throughout. A spike has at most `longest` samples. Its residual
+    exceeds `limit` standard deviations of those around it, and `smallest`, in the output's unit.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     if np.isfinite(y).sum() < _ROWS:
@@ -187,7 +187,7 @@ def equal_runs(
     return stuck, dropped
 
 
-def missed_a_move(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
+def repeated_while_moving(y: FloatArray, voltage: FloatArray, quantum: float | None) -> BoolArray:
     """Return where a reading is repeated, however shortly, while the voltage moves the stack.
 
     The motion that the voltage's change makes must stand out from the noise, and at the end of the
@@ -412,7 +412,7 @@ def _suspects(
     stuck, dropped, flat = (np.zeros(valid.size, dtype=np.bool_) for _ in range(3))
     if equal:
         stuck, dropped = equal_runs(y, moving, quantum)
-        again = missed_a_move(y, moving, quantum) | repeated_in_noise(y, moving, quantum)
+        again = repeated_while_moving(y, moving, quantum) | repeated_in_noise(y, moving, quantum)
         stuck |= again & ~dropped
         ends = flat_ends(y, moving) if quantum is None else ()
         flat = np.any([flat, *(e.where for e in ends)], axis=0)

@@ -274,10 +274,8 @@ def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> N
     read = psa.simulate(model, plan.time, plan.voltage).outputs["displacement"]
     read = read + 5e-9 * np.random.default_rng(2).standard_normal(plan.n)
     measured, output = tmp_path / "measured.csv", tmp_path / "voltage.csv"
-    psa.write_record(
-        measured,
-        {"time [s]": plan.time, "voltage [V]": plan.voltage, "displacement [um]": 1e6 * read},
-    )
+    columns = {"time [s]": plan.time, "voltage [V]": plan.voltage}
+    psa.write_record(measured, {**columns, "displacement [um]": 1e6 * read})
     done(
         "design", "experiment", "--stack", STACK, "--record", measured, "--family", "steps",
         "--starts", "1", "--separate", "sensor_nonlinearity", "slow_creep", "-o", output,

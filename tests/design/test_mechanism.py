@@ -16,13 +16,13 @@ from psa_casadi.design.mechanism.loop import (
     step_response,
 )
 from psa_casadi.design.mechanism.mechanism import (
+    Limits,
     MechanismDesign,
     design_mechanism,
     mechanism_model,
     mounted_model,
     root_locus,
 )
-from psa_casadi.design.mechanism.search import Limits
 from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.model.stacks import stack_model

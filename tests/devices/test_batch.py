@@ -18,7 +18,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi import children
-from psa_casadi.devices import device, executors
+from psa_casadi.devices import executors
 from psa_casadi.devices.executors import outcomes
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
 from psa_casadi.interruption import raise_if_stopped
@@ -38,11 +38,8 @@ def write_device(path: Path, force: float = 1.0, seed: int = 1) -> None:
     """Write the record of a stack whose force per volt has a factor."""
     model = psa.stack_model("P-885.51")
     y = psa.simulate(model.with_values({"k_L": force * model.values["k_L"]}), TIME, VOLTAGE)
-    noise = 3e-9 * np.random.default_rng(seed).standard_normal(TIME.size)
-    psa.write_record(
-        path,
-        {"time [s]": TIME, "voltage [V]": VOLTAGE, "displacement [m]": y.displacement + noise},
-    )
+    x = y.displacement + 3e-9 * np.random.default_rng(seed).standard_normal(TIME.size)
+    psa.write_record(path, {"time [s]": TIME, "voltage [V]": VOLTAGE, "displacement [m]": x})
 
 
 @pytest.fixture
@@ -71,7 +68,7 @@ def stand_in(
         texts.append(task.job.device)
         return work(task) or DeviceOutcome(task.job.device, "done", 0.0)
 
-    monkeypatch.setattr(device, "_worked", worked)
+    monkeypatch.setattr(executors, "_worked", worked)
     return texts
 
 

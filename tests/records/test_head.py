@@ -17,15 +17,19 @@ from tests.records.record_files import T, V, X, table, text
 ROWS = text().splitlines()
 
 
+def fields(*units: str) -> dict[str, Field]:
+    """Return the fields of a record whose columns are in order, in these units."""
+    names = ("time", "voltage", "displacement")
+    return {n: Field(k, u) for k, (n, u) in enumerate(zip(names, units, strict=True))}
+
+
 def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", "of 12 March", "", "time [ms],Drive (V),x/um")
     head = head_of(path, 3)
     assert head.names == ("time", "Drive (V)", "x/um")
     assert head.units == ("ms", "V", "um")
     assert head.rows == tuple(tuple(row.split(",")) for row in ROWS[:3])
-    assert head.guess == {
-        "time": Field(0, "ms"), "voltage": Field(1, "V"), "displacement": Field(2, "um"),
-    }  # fmt: skip
+    assert head.guess == fields("ms", "V", "um")
     packed = tmp_path / "a.csv.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     assert head_of(packed, 3) == head
@@ -33,9 +37,7 @@ def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
 
 def test_what_is_asked_is_guessed_as_it_is_suggested(tmp_path: Path) -> None:
     head = head_of(table(tmp_path / "a.csv", "Elapsed (us),CH1,CH2"))
-    assert head.guess == {
-        "time": Field(0, "us"), "voltage": Field(1, "V"), "displacement": Field(2, "um"),
-    }  # fmt: skip
+    assert head.guess == fields("us", "V", "um")
     head = head_of(table(tmp_path / "b.csv", "t (s),CH1 (mV),CH2 (mV)"))
     assert head.units == ("s", "mV", "mV")
     assert head.guess["voltage"] == Field(1, "mV")
@@ -61,9 +63,7 @@ def test_arrays_of_several_lengths(tmp_path: Path) -> None:
         ("0.001", "1.5", "0.35", "1000"),
         ("0.002", "2.5", "0.45", ""),
     )
-    assert head.guess == {
-        "time": Field(0, "s"), "voltage": Field(1, "mV"), "displacement": Field(2, "um"),
-    }  # fmt: skip
+    assert head.guess == fields("s", "mV", "um")
 
 
 def test_workbooks_and_parquet_files_have_the_same_head(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from psa_casadi.errors import InputError
 from psa_casadi.records import read_record, record_from
 from psa_casadi.records.read.columns import parse_columns
 from tests.records import record_files
-from tests.records.laboratory_bytes import gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
+from tests.records.laboratory_bytes import Cell, gcs, hdf5, lvm, named, npy, npz, tdms, xlsx
 from tests.records.record_files import T, V, X, assert_is, offered, problems_of, refused, text
 
 TABLE = np.column_stack([T, V, X])
@@ -25,6 +25,8 @@ WAVES = {name: {**unit, **WAVE} for name, unit in STATED.items()}
 H5_UNITS = {"run/t": "s", "run/drive voltage": "V", "run/sensor position": "um"}
 H5 = dict(zip(H5_UNITS, (T, V, X), strict=True))
 VX_ROWS = [row[1:] for row in ROWS]
+DRIVEN = {"voltage": V, "displacement": X}
+NAMES: list[list[Cell]] = [[None, "Time", "Voltage", "Weg"], [None, "s", "V", "µm"]]
 FIELDS = named(T, V, X)
 
 #: Files that are read as they are, by what they are; the name implies the ending.
@@ -65,20 +67,12 @@ READ: dict[str, str | bytes] = {
     "units written out": text("Time (sec),Voltage (Volts),Position (microns)"),
     "UTF-16 without a mark": text("Time (s),Voltage (V),Position (um)").encode("utf-16-le"),
     "quoted, units behind a comma": text('"Time, s","Voltage, V","Displacement, um"'),
-    "LabVIEW, one time.lvm": lvm(["Voltage", "Position"], ROWS, units=["Volts", "um"]),
-    "LabVIEW, no time.lvm": lvm(
-        ["Voltage", "Position"], [r[1:] for r in ROWS], columns="No", units=["V", "um"], comma=True
-    ),
+    "LabVIEW, one time.lvm": lvm([*VX], ROWS, units=["Volts", "um"]),
+    "LabVIEW, no time.lvm": lvm([*VX], VX_ROWS, columns="No", units=["V", "um"], comma=True),
     "LabVIEW, times of channels.lvm": lvm(["Voltage (V)", "Position (um)"], ROWS, columns="Multi"),
     "Excel.xlsx": xlsx([["Time (s)", "Voltage (V)", "Position (um)"], *ROWS]),
     "Excel, preamble and units.xlsx": xlsx(
-        [
-            ["gain", 10, "V/V"],
-            [],
-            [None, "Time", "Voltage", "Weg"],
-            [None, "s", "V", "µm"],
-            *([None, *row] for row in ROWS),
-        ]
+        [["gain", 10, "V/V"], [], *NAMES, *([None, *row] for row in ROWS)]
     ),
     "Excel, second sheet.xlsx": xlsx([["notes"], ["date, place"]], [["t/s", "U/V", "x/um"], *ROWS]),
     "TDMS, waveforms.tdms": tdms(VX, WAVES),
@@ -87,9 +81,9 @@ READ: dict[str, str | bytes] = {
     ),
     "HDF5, groups and units.h5": hdf5(H5, H5_UNITS),
     "HDF5, packed, a sample rate.hdf5": hdf5(
-        {"voltage": V, "displacement": X},
+        DRIVEN,
         {"voltage": "V", "displacement": "um"},
-        {"fs": 1000.0},
+        {"fs": 1e3},
         compression="gzip",
         shuffle=True,
     ),
@@ -113,6 +107,8 @@ def test_a_laboratorys_file_is_read_as_it_is(form: str, tmp_path: Path) -> None:
     assert_read(kept(tmp_path, form, READ[form]))
 
 
+#: Counted samples of two channels, with three empty cells.
+COUNTED = (np.arange(20), V, X, *[[""] * 20] * 3)
 #: Files that do not say enough.
 OPEN: dict[str, str | bytes] = {
     "symbols without units": text("t,V,x"),
@@ -124,13 +120,10 @@ OPEN: dict[str, str | bytes] = {
     ),
     "an oscilloscope, names below settings": text("Model,X,1", "x-axis,1,2"),
     "an oscilloscope, volts": text("x-axis,1,2", "second,Volt,Volt"),
-    "an oscilloscope, steps counted": "\n".join(
-        [
-            "X,CH1,CH2,Start,Increment,",
-            "Sequence,Volt,Volt,0.000000e+00,1.000000e-03,",
-            *(f"{k},{v:.6g},{x:.6g},,," for k, (v, x) in enumerate(zip(V, X, strict=True))),
-            "",
-        ]
+    "an oscilloscope, steps counted": text(
+        "X,CH1,CH2,Start,Increment,",
+        "Sequence,Volt,Volt,0.000000e+00,1.000000e-03,",
+        columns=COUNTED,
     ),
     "channels with spaces": text("Zeit;Kanal A;Kanal B", "(s);(V);(mV)", mark=";", point=","),
     "LabVIEW, untitled.lvm": lvm(["Untitled", "Untitled 1"], ROWS),

@@ -119,16 +119,8 @@ def outliers_and_lines(rng: Rng, y: FloatArray) -> FloatArray:
 
 
 Noise = Callable[[Rng, FloatArray], FloatArray]
-KINDS: dict[str, Noise] = {
-    "autoregressive": autoregressive,
-    "one_over_f": one_over_f,
-    "telegraph": telegraph,
-    "steps": steps,
-    "heavy_tails": heavy_tails,
-    "outliers": outliers,
-    "jitter": jitter,
-    "lines": lines,
-}
+NOISES = (autoregressive, one_over_f, telegraph, steps, heavy_tails, outliers, jitter, lines)
+KINDS: dict[str, Noise] = {noise.__name__: noise for noise in NOISES}
 
 
 def kinds_in(noise: Noise, drive: Callable[[Rng], FloatArray], seed: int) -> tuple[NoiseKind, ...]:

@@ -272,10 +272,8 @@ def tektronix(name: str, values: Any) -> str:
 
 
 def test_settings_beside_the_samples_are_no_samples(tmp_path: Path) -> None:
-    paths = [
-        written(tmp_path, tektronix(f"CH{k}", values), f"F0000CH{k}.CSV")
-        for k, values in ((1, V), (2, X))
-    ]
+    channels = {"CH1": V, "CH2": X}
+    paths = [written(tmp_path, tektronix(n, y), f"F0000{n}.CSV") for n, y in channels.items()]
     with pytest.raises(InputError) as caught:
         read_records(paths)
     requested = offered(str(caught.value))

@@ -14,12 +14,8 @@ from psa_casadi.units import BoolArray, FloatArray
 
 
 def record(voltage: FloatArray) -> Record:
-    return Record(
-        name="r",
-        time=np.linspace(0.0, 1e-3 * (len(voltage) - 1), len(voltage)),
-        voltage=voltage,
-        displacement=1e-7 * voltage,
-    )
+    time = np.linspace(0.0, 1e-3 * (len(voltage) - 1), len(voltage))
+    return Record(name="r", time=time, voltage=voltage, displacement=1e-7 * voltage)
 
 
 def triangle(samples: int, period: int) -> FloatArray:

@@ -149,12 +149,8 @@ class Rival:
         planned: Any = Signals(name="planned", time=np.arange(8.0), columns={})
         new = replace(whole(planned), known_start=self.known_start, channels=(_NOTHING,))
         unknowns = unknowns_around(self.model, (), [new], [1.0], placed=self.model)
-        return {
-            name: (float(size), float(prior))
-            for name, size, prior in zip(
-                unknowns.started[0], unknowns.start_scale[0], unknowns.prior, strict=False
-            )
-        }
+        rows = zip(unknowns.started[0], unknowns.start_scale[0], unknowns.prior, strict=False)
+        return {name: (float(size), float(prior)) for name, size, prior in rows}
 
     @cached_property
     def _offsets(self) -> FloatArray:

@@ -224,8 +224,8 @@ def _reachable(
     """Return levels whose changes the rate allows, from `now`, each moved as little as needed."""
     values = np.empty_like(levels)
     for k, (level, duration) in enumerate(zip(levels, durations, strict=True)):
-        now += float(np.clip(level - now, -0.999 * per_second * duration,
-                             0.999 * per_second * duration))  # fmt: skip
+        most = 0.999 * per_second * duration
+        now += float(np.clip(level - now, -most, most))
         values[k] = now
     return values
 

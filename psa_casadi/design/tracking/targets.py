@@ -182,7 +182,7 @@ def usage(
     )
 
 
-def breaks(response: Response, limits: AmplifierLimits, slack: float = 1e-3) -> bool:
+def exceeds_limits(response: Response, limits: AmplifierLimits, slack: float = 1e-3) -> bool:
     """Whether a response breaks a limit by more than the share `slack`."""
     v = response.voltage
     span = limits.max_voltage - limits.min_voltage
@@ -344,16 +344,12 @@ def binding(response: Response, limits: AmplifierLimits) -> tuple[str, ...]:
     A rate or a current counts where it lasts for three samples at least.
     """
     v, rate, current = response.voltage, np.abs(response.rate), np.abs(response.current)
-    room, most = _BINDS * np.ptp(v), limits.max_rate
+    room, most, amperes = _BINDS * np.ptp(v), limits.max_rate, limits.max_current
     cases = (
         (f"highest voltage, {limits.max_voltage:.4g} V", v > limits.max_voltage - room, 1),
         (f"lowest voltage, {limits.min_voltage:.4g} V", v < limits.min_voltage + room, 1),
         (f"largest rate, {most:.4g} V/s", np.append(rate[:1], rate) > (1.0 - _BINDS) * most, 3),
-        (
-            f"largest current, {limits.max_current:.4g} A",
-            current > (1.0 - 3.0 * _BINDS) * limits.max_current,
-            3,
-        ),
+        (f"largest current, {amperes:.4g} A", current > (1.0 - 3.0 * _BINDS) * amperes, 3),
     )
     sentences = []
     for name, holds, fewest in cases:

@@ -29,10 +29,10 @@ from psa_casadi.design.tracking.targets import (
     Response,
     Target,
     TrackingError,
-    breaks,
     demand_stack,
     dynamics_of,
     error_of,
+    exceeds_limits,
     respond,
     rest_at,
     smooth_form,
@@ -72,14 +72,10 @@ def interval_of(dynamics: Dynamics, *, symbolic: bool = True) -> Interval:
     x, ends, clock = kind.sym("x", nx), kind.sym("v", 2), kind.sym("clock", 2)
     inner = kind.sym("inner", 2 * nx)
     stages = [inner[:nx], inner[nx:]]
-    results = [
-        dynamics.f.call(
-            [clock[0] + c * clock[1], size * stage, ends[0] + c * (ends[1] - ends[0])],
-            not symbolic,
-            False,
-        )
-        for c, stage in zip(NODES, stages, strict=True)
-    ]
+    results = []
+    for c, stage in zip(NODES, stages, strict=True):
+        node = [clock[0] + c * clock[1], size * stage, ends[0] + c * (ends[1] - ends[0])]
+        results.append(dynamics.f.call(node, not symbolic, False))
     rates = [clock[1] * xdot / size for xdot, _, _ in results]
     residuals = [
         stage - x - weights[0] * rates[0] - weights[1] * rates[1]
@@ -234,13 +230,10 @@ class Program:
                 " the limits or slow the path down."
             )
         x = np.array(solution["x"]).ravel()
-        return Solution(
-            np.concatenate([[q.rest, q.rest], q.scale * x[free]]),
-            x[: inner.size].reshape(inner.T.shape).T,
-            np.array(self._outputs(solution["x"])),
-            int(stats["iter_count"]),
-            bool(stats["success"]),
-        )
+        designed = np.concatenate([[q.rest, q.rest], q.scale * x[free]])
+        states = x[: inner.size].reshape(inner.T.shape).T
+        displacement, count = np.array(self._outputs(solution["x"])), int(stats["iter_count"])
+        return Solution(designed, states, displacement, count, bool(stats["success"]))
 
     def _constraints(
         self, residual: Expression, current: Expression, lengths: FloatArray
@@ -273,10 +266,8 @@ class Program:
         q = self.problem
         bends: Expression = PRICE * ca.diff(self._voltage, 2, 1).T / q.scale
         share = _REST if q.minimax else 1.0
-        terms = ca.vertcat(
-            self._errors * np.sqrt(share / self._errors.shape[0]),
-            bends / np.sqrt(bends.shape[0]),
-        )
+        errors = self._errors * np.sqrt(share / self._errors.shape[0])
+        terms = ca.vertcat(errors, bends / np.sqrt(bends.shape[0]))
         cost = WEIGHT * ca.sumsqr(terms)
         slopes = ca.jacobian(terms, self._x)
         sigma = ca.MX.sym("sigma")
@@ -350,7 +341,7 @@ def track(
     error, is returned.
 
     Raises InputError for a model that is no stack, limits that contradict each other or the path's
-    start, and PsaError if no voltage within the limits is found.
+    start, and PsaError if there is no voltage within the limits.
     """
     started = clocks.perf_counter()
     bounds = limits or AmplifierLimits()
@@ -390,10 +381,10 @@ def _chosen(
         error = error_of(target, response.displacement)
         share = 1.0 if best.converged else _IMPROVEMENT
         designed, inverted = ((e.largest if minimax else e.rms) for e in (error, cut.error))
-        if designed <= share * inverted or breaks(cut.response, limits):
+        if designed <= share * inverted or exceeds_limits(cut.response, limits):
             predicted = np.concatenate([target.displacement[:1], best.displacement[1]])
             return response, error, predicted, True, best.converged
-    elif breaks(cut.response, limits):
+    elif exceeds_limits(cut.response, limits):
         raise PsaError(
             "No voltage within the limits was found that comes near the path; widen the limits or"
             " slow the path down."

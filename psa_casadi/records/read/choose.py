@@ -136,7 +136,7 @@ class Choice:
         """Suggest columns of a table without a header by their numbers."""
         table, required = self.table, self.required
         free = [k for k in range(len(table.header)) if not table.sizes or table.sizes[k] > 1]
-        time = next((k for k in free if rises(table, k)), None) if "time" in required else None
+        time = next((k for k in free if is_rising(table, k)), None) if "time" in required else None
         rest = iter(k for k in free if k != time)
         places = {name: time if name == "time" else next(rest, None) for name in required}
         self.sources = {n: usual_source(n, str(k + 1)) for n, k in places.items() if k is not None}
@@ -265,7 +265,7 @@ class Choice:
                 (rank, column == "displacement" and cell.channel != number, k)
                 for k, cell in enumerate(free)
                 if cell not in cells.values() and (rank := cell.rank(column)) is not None
-                if column != "time" or rises(self.table, cell.index)
+                if column != "time" or is_rising(self.table, cell.index)
             ]
             if ranks:
                 cells[column] = free[min(ranks)[-1]]
@@ -357,7 +357,7 @@ def with_usual_units(table: Table) -> Table:
     return replace(table, header=header) if table.sizes else table
 
 
-def rises(table: Table, index: int) -> bool:
+def is_rising(table: Table, index: int) -> bool:
     """Whether a column is one of instants, or of numbers each of which is larger than the last."""
     cells = table.glance[index]
     times = as_times(cells, "s")
@@ -479,7 +479,7 @@ class ByName:
         taken = {field.index for field in fields.values()}
         for index in (k for k in self._cells() if k not in taken):
             meant = understood(self._text(index))
-            if meant is not None and meant.column == "time" and rises(self.table, index):
+            if meant is not None and meant.column == "time" and is_rising(self.table, index):
                 return Field(index, meant.unit or "s")
         return None
 
@@ -490,7 +490,7 @@ class ByName:
         keys = {_key(label): k for k, label in labels.items()}
         near = [keys[n] for n in difflib.get_close_matches(_key(name), keys, 1, 0.6)]
         if name == "time":
-            near = [k for k in labels if rises(self.table, k)]
+            near = [k for k in labels if is_rising(self.table, k)]
         if near:
             unit = stated_unit(self._text(near[0])) or self._usual(name)
             self.sources[name] = Source(labels[near[0]], unit or None)

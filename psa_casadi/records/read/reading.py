@@ -25,7 +25,7 @@ from psa_casadi.display import with_units
 from psa_casadi.errors import InputError, Problems
 from psa_casadi.files import atomic_write
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.choose import rises
+from psa_casadi.records.read.choose import is_rising
 from psa_casadi.records.read.columns import (
     ALL,
     TABLE,
@@ -38,14 +38,7 @@ from psa_casadi.records.read.columns import (
 )
 from psa_casadi.records.read.formats import Series, array_tables
 from psa_casadi.records.read.samples import Outcome, Request, samples_of
-from psa_casadi.records.read.table import (
-    Cells,
-    Columns,
-    Table,
-    as_numbers,
-    is_stamp,
-    seconds_of,
-)
+from psa_casadi.records.read.table import Cells, Columns, Table, as_numbers, is_stamp, seconds_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.units import FloatArray, parse_unit, to_si
@@ -64,8 +57,8 @@ def joined(
 
     Each file has a path, tables and a SHA-256. The clock is that of the first;
     where another differs, its channels are interpolated at those instants that both have, and a
-    note says so. A channel's name that several files have gets the file's in front. `alone` refuses
-    files of several channels.
+    note states it. A channel's name that several files have gets the file's in front. `alone`
+    refuses files of several channels.
 
     Raises:
         InputError: a file is no table of a time and channels.
@@ -124,7 +117,7 @@ def _channels(
     path: str, tables: Sequence[Table]
 ) -> tuple[Cells, str, list[tuple[str, str | None, FloatArray]]]:
     """Return the times of a file with their unit, and its channels: name, unit, values."""
-    rising = [k for k in range(len(tables[0].header)) if rises(tables[0], k)] if tables else []
+    rising = [k for k in range(len(tables[0].header)) if is_rising(tables[0], k)] if tables else []
     if not rising:
         raise InputError(f"{path}: holds no time, which files to be joined need.")
     table, at, problems = tables[0], rising[0], Problems()

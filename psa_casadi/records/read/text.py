@@ -67,7 +67,7 @@ class Layout:
 
 def laid_out(lines: Sequence[str], mark: str) -> Layout | None:
     """Return the place of the first header and its numbers; `mark` is "" if it is not stated."""
-    start = next((k for k, line in enumerate(lines) if holds(line)), None)
+    start = next((k for k, line in enumerate(lines) if has_content(line)), None)
     if start is None:
         return None
     place = _named(lines, [start, *range(min(len(lines), _MOST_LINES))], mark)
@@ -147,7 +147,7 @@ def delimiter_of(line: str) -> str:
     return most if most in line else " "
 
 
-def holds(line: str) -> bool:
+def has_content(line: str) -> bool:
     """Whether a line has something in it and is no comment."""
     return bool(line.strip()) and not line.startswith("#")
 
@@ -224,7 +224,7 @@ def text_tables(path: str, lines: Sequence[str], place: str, name: str = "") -> 
         mark, lines = separator[1], ["", *lines[1:]]
     first = _in_rows(lines, mark) or laid_out(lines, mark)
     if header:
-        first = Layout(header, delimiter_of(next(filter(holds, lines), "")), 0, 0)
+        first = Layout(header, delimiter_of(next(filter(has_content, lines), "")), 0, 0)
     if first is None:
         return []
     if isinstance(first, Table):
@@ -273,7 +273,7 @@ class _Part:
 
     def table(self, name: str, step: float | None) -> Table:
         layout = self.layout
-        first = next((row for row in self.rows if holds(row)), "")
+        first = next((row for row in self.rows if has_content(row)), "")
         width = len(layout.header) or len(self._cells(first))
         bare = Table(
             path=self.path, name=name, header=layout.header or [""] * width, labels=[],
