@@ -44,7 +44,7 @@ class Block:
 
     Its equations are evaluated by CasADi's virtual machine on memory that is laid out once: a
     sample allocates nothing. Two copies of what is kept take turns as source and target. Inputs
-    (`given`) and outputs (`out`) are in the order in which the component declares them. `values`
+    and outputs are in the order in which the component declares them. `values`
     may hold more than its parameters. A pickled block goes on where it was.
 
     Raises InputError for a value that is out of bounds.
@@ -76,22 +76,22 @@ class Block:
         self._function = ca.Function("recursion", [s.z, s.u], [after, out], {"cse": True})
         self._kept = (np.array(kept, dtype=float), np.array(kept, dtype=float))
         inputs, outputs = np.zeros(s.u.numel()), np.zeros(s.y.numel())
-        self._given: Any = inputs.data
-        self._out: Any = outputs.data
+        self._inputs: Any = inputs.data
+        self._outputs: Any = outputs.data
         # bound to memory twice: each reads from one copy and writes to the other
         self._bound: Any = [self._function.buffer() for _ in self._kept]
         for source, (buffer, _) in enumerate(self._bound):
-            for k, memory in enumerate((self._kept[source].data, self._given)):
+            for k, memory in enumerate((self._kept[source].data, self._inputs)):
                 buffer.set_arg(k, memory)
-            for k, memory in enumerate((self._kept[1 - source].data, self._out)):
+            for k, memory in enumerate((self._kept[1 - source].data, self._outputs)):
                 buffer.set_res(k, memory)
         self._turn = 0
 
     def _advance(self) -> float:
-        """Advance by one sample, for which `_given` has been written; return the first output."""
+        """Advance by one sample, for which `_inputs` has been written; return the first output."""
         self._bound[self._turn][1]()
         self._turn = 1 - self._turn
-        return float(self._out[0])
+        return float(self._outputs[0])
 
     def __getstate__(self) -> dict[str, Any]:
         return {"model": self._model, "kept": self.kept}
@@ -120,7 +120,7 @@ class Following(Block):
                 f" {1e6 * self._stroke:.3g} um; give metres, such as {0.5 * self._stroke:.2g}. For"
                 " volts of a linear stack call step_voltage."
             )
-        self._given[0] = wanted
+        self._inputs[0] = wanted
         return self._advance()
 
 
@@ -178,7 +178,7 @@ class HysteresisObserver(Block):
 
     def step(self, voltage: float) -> float:
         """Take one sample of the voltage [V] and return the hysteresis force [N]."""
-        self._given[0] = voltage
+        self._inputs[0] = voltage
         return self._advance()
 
 
@@ -251,12 +251,14 @@ class _Learning(Block):
         """Parameters, force and what is left of their uncertainty after the last sample."""
         kept, p = self.kept, self.model.values
         c = constants(p)
-        items = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
+        values = [float(v) for v in estimates(c, [kept[f"z_{n}"] for n in TRACKED])]
         factors = [
             [*(kept[f"U_{i + 1}_{j + 1}"] for i in range(j)), kept[f"D_{j + 1}"]]
             for j in range(COUNT)
         ]
-        parameters, left = (dict(zip(TRACKED, v, strict=True)) for v in (items, variances(factors)))
+        parameters, left = (
+            dict(zip(TRACKED, v, strict=True)) for v in (values, variances(factors))
+        )
         return Estimate(parameters, kept["f_H"], left)
 
 
@@ -273,9 +275,9 @@ class OnlineIdentification(_Learning):
 
     def step(self, voltage: float, displacement: float) -> float:
         """Take one sample [V], [m] and return the estimated hysteresis force [N]."""
-        self._given[0], self._given[1] = voltage, displacement
+        self._inputs[0], self._inputs[1] = voltage, displacement
         self._advance()
-        return float(self._out[COUNT])
+        return float(self._outputs[COUNT])
 
 
 class AdaptiveFeedForward(_Learning, Following):
@@ -295,12 +297,12 @@ class AdaptiveFeedForward(_Learning, Following):
         Raises InputError, and stays where it is, for a wish that is no displacement of this stack:
         no number, or beyond ten strokes.
         """
-        self._given[1] = measured
+        self._inputs[1] = measured
         return self._follow(wanted)
 
     def step_voltage(self, wanted: float, measured: float) -> float:
         """Return the next voltage for the wanted voltage of a linear stack [V], as `step` does."""
-        self._given[1] = measured
+        self._inputs[1] = measured
         return self._follow(self._per_volt * wanted)
 
 

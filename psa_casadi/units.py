@@ -137,8 +137,8 @@ _LONGEST_SYMBOL = 24
 
 def units_of(quantity: str) -> tuple[str, ...]:
     """Return the symbols of the units of one quantity, such as "voltage", largest first."""
-    items = [unit for unit in UNITS.values() if unit.quantity == quantity]
-    return tuple(unit.name for unit in sorted(items, key=lambda unit: -unit.ratio))
+    units = [unit for unit in UNITS.values() if unit.quantity == quantity]
+    return tuple(unit.name for unit in sorted(units, key=lambda unit: -unit.ratio))
 
 
 def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
@@ -177,7 +177,7 @@ def parse_unit(text: str, quantity: str = "", *, common: bool = False) -> Unit:
                 raise InputError(_not_a_unit(text))
             counts += power * unit.counts
             exponents = [
-                e + power * item for e, item in zip(exponents, unit.exponents, strict=True)
+                e + power * other for e, other in zip(exponents, unit.exponents, strict=True)
             ]
     if counts.denominator != 1:
         raise InputError(_not_a_unit(text))
@@ -214,10 +214,10 @@ def _from_pint(symbol: str) -> Unit | None:
         return None
     ratio = Fraction(factor).limit_denominator(10**40)
     kg, m, s, A, K, mol, cd, rad, count = map(int, exponents)
-    result = Unit(symbol, ratio, float(offset), (kg, m, s, A, K, mol, cd, rad), count)
-    items = [unit for unit in UNITS.values() if unit.dimension == result.dimension]
-    same = [u for u in items if (u.ratio, u.offset) == (result.ratio, result.offset)]
-    return next(iter(same), replace(result, quantity=items[0].quantity if items else ""))
+    read = Unit(symbol, ratio, float(offset), (kg, m, s, A, K, mol, cd, rad), count)
+    similar = [unit for unit in UNITS.values() if unit.dimension == read.dimension]
+    same = [u for u in similar if (u.ratio, u.offset) == (read.ratio, read.offset)]
+    return next(iter(same), replace(read, quantity=similar[0].quantity if similar else ""))
 
 
 def _not_a_unit(text: str) -> str:

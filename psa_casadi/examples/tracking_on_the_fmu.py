@@ -35,14 +35,14 @@ def main(folder: Path) -> dict[str, float]:
         ),
         start_values={"load_force": 0.0}, output=["displacement"], relative_tolerance=1e-7,
     )  # fmt: skip
-    displayed = np.interp(path.time, played["time"], played["displacement"])
-    _draw(folder / "tracking_on_the_fmu.png", path, on_fmu, displayed)
+    followed = np.interp(path.time, played["time"], played["displacement"])
+    _draw(folder / "tracking_on_the_fmu.png", path, on_fmu, followed)
     difference = float(np.max(np.abs(on_fmu.voltage - expected.voltage)))
     return {
         "voltage differs from the symbolic model's by [V]": difference,
         "largest voltage [V]": float(on_fmu.voltage.max()),
         "error in fmpy [% of range, rms]": 100.0
-        * float(np.sqrt(np.mean((displayed - path.displacement) ** 2)))
+        * float(np.sqrt(np.mean((followed - path.displacement) ** 2)))
         / path.span,
     }
 
@@ -69,12 +69,12 @@ def fmu_equations(unpacked: str, smooth: psa.Model) -> Dynamics:
     return Dynamics(ca.Function("on_fmu", [time, x, v], outputs), smooth.state_nominals())
 
 
-def _draw(path: Path, target: Target, tracked_input: TrackedInput, displayed: np.ndarray) -> None:
+def _draw(path: Path, target: Target, tracked_input: TrackedInput, followed: np.ndarray) -> None:
     t = 1e3 * target.time
     figure = Figure(figsize=(8.0, 6.0), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True)
     above.plot(t, 1e6 * target.displacement, color="#222222", linewidth=3.0, label="path")
-    above.plot(t, 1e6 * displayed, color="#56b4e9", label="the FMU in fmpy")
+    above.plot(t, 1e6 * followed, color="#56b4e9", label="the FMU in fmpy")
     above.set_ylabel("displacement [um]")
     below.plot(t, tracked_input.voltage, color="#0072b2", label="designed on the FMU")
     below.set_ylabel("voltage [V]")

@@ -40,7 +40,7 @@ from psa_casadi.variables import Interval, Parameter, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
 #: What a diagnosis may add to the effects of the table.
-_BESIDE = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
+_FURTHER = {c.name: c for c in (*MODAL_SERIES.values(), *PATCHES.values())}
 _STATED = tuple(f.name for f in fields(Publication))
 _ADVICE = "give a file that `psa identify` or `psa diagnose` wrote."
 
@@ -146,7 +146,7 @@ def dumps(model: Model) -> str:
 
 def _written(model: Model) -> dict[str, OwnComponent]:
     """Return what the file has of components that are in no table and of no module, by name."""
-    known = (*COMPONENTS.values(), *EFFECTS.values(), *_BESIDE.values())
+    known = (*COMPONENTS.values(), *EFFECTS.values(), *_FURTHER.values())
     about = f"The model {brief(model.name)} cannot be saved as MODEL.json:"
     problems, result = Problems(), dict[str, OwnComponent]()
     for name, count in Counter(c.name for c in model.components).items():
@@ -199,7 +199,7 @@ def model_of(
     except InputError as error:
         _refuse(error.problems, source)
         raise
-    tables = {**COMPONENTS, **own}, {**known_effects(effects), **_BESIDE, **own}
+    tables = {**COMPONENTS, **own}, {**known_effects(effects), **_FURTHER, **own}
     _refuse(_problems(content, *tables), source)
     file = decode(ModelFile, content, source)
     components = [tables[0][name] for name in file.components]

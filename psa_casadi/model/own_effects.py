@@ -42,7 +42,7 @@ def own_effects(module: str) -> Mapping[str, Component]:
     InputError where the module cannot be imported, holds none, or holds one that does not fit
     beside the base model.
     """
-    return _beside_base(declared_effects(module))
+    return _fitting_the_base(declared_effects(module))
 
 
 def declared_effects(module: str) -> Mapping[str, Component]:
@@ -50,7 +50,7 @@ def declared_effects(module: str) -> Mapping[str, Component]:
     return _effects_of(_imported(module, here=True))
 
 
-def _beside_base(components: Mapping[str, Component]) -> Mapping[str, Component]:
+def _fitting_the_base(components: Mapping[str, Component]) -> Mapping[str, Component]:
     if unfit := misfits(components.values()):
         raise InputError(unfit)
     return components
@@ -93,7 +93,7 @@ def installed_effects() -> Mapping[str, Component]:
     """Return the effects of installed packages that have the entry point; raises InputError."""
     with _installed_only():
         modules = sorted({e.value.partition(":")[0] for e in entry_points(group=GROUP)})
-    each = [_beside_base(_effects_of(_imported(module))) for module in modules]
+    each = [_fitting_the_base(_effects_of(_imported(module))) for module in modules]
     return {name: c for effects in each for name, c in effects.items()}
 
 

@@ -54,7 +54,7 @@ class Stack:
         return tuple(name for name, figure in self.values.items() if figure.assumed)
 
 
-def _given(value: float, source: str) -> Figure:
+def _sourced(value: float, source: str) -> Figure:
     return Figure(value, source, assumed=False)
 
 
@@ -82,19 +82,19 @@ def _identified(
     """Return the figures that a fit found; those that the record leaves open count as assumed."""
     forces = ("k_L", "A", "beta", "gamma", "delta")
     scale = "; in proportion to the assumed k_P and k_B"
-    table = {n: _given(v, run + (scale if n in forces else "")) for n, v in values.items()}
+    table = {n: _sourced(v, run + (scale if n in forces else "")) for n, v in values.items()}
     left = f"{run}, which leaves it open: near where the fit started"
     return table | {n: _assumed(v, left) for n, v in undetermined.items()}
 
 
-def _beside_the_record(top: float, h_ref: float, hold_rate: float) -> dict[str, Figure]:
+def _not_in_the_record(top: float, h_ref: float, hold_rate: float) -> dict[str, Figure]:
     """Return the figures that `psa identify` does not search; all but the voltages are assumed."""
     slow = "Too fast to show in the record: the ordinary mass of the base model."
     soft = "Of the order of a stack's, since none is known: forces are right in proportion only."
     return {
-        "G": _given(1.0, "definition: the voltage is the one that the record holds"),
+        "G": _sourced(1.0, "definition: the voltage is the one that the record holds"),
         "C_p": _assumed(1.6e-6, "As the paper's stacks; the record shows R_s C_p only."),
-        "u_rated": _given(top, "the largest voltage of the record"),
+        "u_rated": _sourced(top, "the largest voltage of the record"),
         "h_ref": _assumed(h_ref, "A tenth of the linear force over the span; beta and gamma fit."),
         "hold_rate": _assumed(hold_rate, "A span in 1000 s, far below the record's rates."),
         "m_P": _assumed(5e-3, slow),
@@ -111,10 +111,10 @@ PTBS200 = Stack(
         " has lost the zeros); outline assumed 8 x 8 x 20 mm"
     ),
     values={
-        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
+        "G": _sourced(1.0, "definition: the voltage is the one that the amplifier puts out"),
         "R_s": _assumed(8.0, "R_s C_p = 13 us gives the paper's voltage rise of under 30 us."),
-        "C_p": _given(1.6e-6, f"{PAPER}, section 4.2: 1.6 uF"),
-        "u_rated": _given(200.0, f"{PAPER}, section 4.2: 200 V"),
+        "C_p": _sourced(1.6e-6, f"{PAPER}, section 4.2: 1.6 uF"),
+        "u_rated": _sourced(200.0, f"{PAPER}, section 4.2: 200 V"),
         "k_L": _assumed(10.1, "The paper's 18 um at 200 V through the assumed stiffness."),
         **_hysteresis(10.1, 200.0),
         "tau": _assumed(2e-5, "Short, since the measured step rings."),
@@ -150,11 +150,11 @@ P88551 = Stack(
         " 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51)"
     ),
     values={
-        "G": _given(1.0, "definition: the voltage is the one that the amplifier puts out"),
+        "G": _sourced(1.0, "definition: the voltage is the one that the amplifier puts out"),
         "R_s": _assumed(8.0, "R_s C_p = 12 us gives the paper's voltage rise of under 30 us."),
-        "C_p": _given(1.5e-6, f"{PAPER}, section 4.2: 1.5 uF; so the data sheet of the P-885.51"),
-        "u_rated": _given(120.0, f"{PAPER}, section 4.2: 120 V; so the data sheet"),
-        "k_L": _given(7.3, "18 um at 120 V (paper, data sheet) through k_P and k_B"),
+        "C_p": _sourced(1.5e-6, f"{PAPER}, section 4.2: 1.5 uF; so the data sheet of the P-885.51"),
+        "u_rated": _sourced(120.0, f"{PAPER}, section 4.2: 120 V; so the data sheet"),
+        "k_L": _sourced(7.3, "18 um at 120 V (paper, data sheet) through k_P and k_B"),
         **_hysteresis(7.3, 120.0),
         "tau": _assumed(1e-4, "The slowest pole; the paper's quickest stack to settle."),
         "m_P": _assumed(1.2e-3, "A third of the 3.5 g of ceramic."),
@@ -162,7 +162,9 @@ P88551 = Stack(
         "k_P": _assumed(2.5e8, "Five times k_B, so that the data sheet's stiffness is k_B."),
         "m_B": _assumed(1.0e-3, "With k_B 35 kHz: clamped, half of the data sheet's free 70 kHz."),
         "c_B": _assumed(670.0, "Damping ratio 1.5: the paper calls the stack overdamped."),
-        "k_B": _given(5e7, "Physik Instrumente data sheet P-885.51: 50 N/um, 900 N blocking force"),
+        "k_B": _sourced(
+            5e7, "Physik Instrumente data sheet P-885.51: 50 N/um, 900 N blocking force"
+        ),
     },
 )
 
@@ -170,7 +172,7 @@ DEMO = Stack(
     name="demo",
     description="the synthetic stack of the demonstration, which creeps; its base model only",
     values={
-        **_beside_the_record(top=65.554, h_ref=105.670, hold_rate=0.065554),
+        **_not_in_the_record(top=65.554, h_ref=105.670, hold_rate=0.065554),
         **_identified(
             "identified by `psa identify psa_casadi/data/demo.csv` (synthetic record)",
             {"k_L": 21.6765, "A": -7.45580, "beta": 2.65995, "gamma": -0.316797, "n": 1.57145}
@@ -187,7 +189,7 @@ MICROMANIPULATOR = Stack(
         " forces per volt include the amplifier's gain; nested minor loops at 1 Hz"
     ),
     values={
-        **_beside_the_record(top=3.42367, h_ref=158.479, hold_rate=3.18734e-3),
+        **_not_in_the_record(top=3.42367, h_ref=158.479, hold_rate=3.18734e-3),
         **_identified(
             "identified by `psa identify minor_loops.csv`, measured by Y. N. Aye (GitHub"
             " yan9a/DiscreteBacklashOperator, MIT licence)",

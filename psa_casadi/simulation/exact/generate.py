@@ -11,7 +11,7 @@ from psa_casadi.simulation.exact.printing import Printer
 from psa_casadi.simulation.exact.split import Split, closure, dependence
 from psa_casadi.units import BoolArray
 
-_GIVEN = "real t, const real *x, const real *v, real w, const real *k, real *out"
+_OF_NUMBERS = "real t, const real *x, const real *v, real w, const real *k, real *out"
 _OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"
 #: Rows whose sums fit in the processor's registers together with their terms.
 CHUNK = 8
@@ -26,7 +26,7 @@ class Entry:
     index: int
 
 
-def dispatch(name: str, count: int, text: str = _GIVEN) -> str:
+def dispatch(name: str, count: int, text: str = _OF_NUMBERS) -> str:
     """Return a function that calls the one with the number `which`."""
     passed = [q.split()[-1].lstrip("*") for q in text.split(",")]
     unused = ", ".join(f"(void){q}" for q in passed)
