@@ -51,7 +51,8 @@ def read_otherwise(
     noisy readings, or through smoothed ones. The same fit if it was interrupted.
     """
     best, read, notes = of, tuple(experiments), list[Note]()
-    for change in () if of.interrupted else (held_otherwise, _smoothed_instead)[not undecided :]:
+    changes = (held_otherwise, _smoothed_instead) if undecided else (_smoothed_instead,)
+    for change in () if of.interrupted else changes:
         if other := change(best, read):
             best, read, why = other
             notes.append(why)
