@@ -208,11 +208,11 @@ def even_clock(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
     """
     even = [_evened(e.record) for e in experiments]
     held = None
-    if any(item is not e.record for item, e in zip(even, experiments, strict=True)):
+    if any(record is not e.record for record, e in zip(even, experiments, strict=True)):
         held = _held(fit, experiments, _of_even)
     if held is None:
         return None
-    moved = tuple(replace(e, record=item) for e, item in zip(experiments, even, strict=True))
+    moved = tuple(replace(e, record=record) for e, record in zip(experiments, even, strict=True))
     late = np.concatenate(
         [new.record.time - e.record.time for new, e in zip(moved, experiments, strict=True)]
     )
