@@ -84,21 +84,21 @@ def plans(models: Sequence[Model], records: Sequence[Record]) -> list[Plan]:
     lowest = _round(min(now, 20.0 / settling, finest))
     count = min(_RUNGS, ceil(2.0 * log10(finest / lowest)) + 1)
     rates = sorted({_round(float(r)) for r in np.geomspace(lowest, finest, count)})
-    items = [p for rate in rates for p in _fast(rate, low, high)]
+    result = [p for rate in rates for p in _fast(rate, low, high)]
     # loops of a frequency at which records cycle slowly, else of a quasi-static one
     limit = _QUASI_STATIC / settling
     turns = [(len(reversals(r.voltage)), r.duration) for r in records]
     cycling = [count / (2.0 * length) for count, length in turns if count >= 2]
     slow = [f for f in cycling if f <= limit]
-    items += _loops(_round(float(np.median(slow)) if slow else 0.1 * limit), settling, low, high)
+    result += _loops(_round(float(np.median(slow)) if slow else 0.1 * limit), settling, low, high)
     if models[0].effects:
         longest = max(r.duration for r in records)
         lengths = [longest * k for k in (10.0, 100.0) if longest * k <= _LONGEST_HOLD]
-        items += [
+        result += [
             _stepped("hold", HOLD_SAMPLES / n, HOLD_SAMPLES, low, high, HOLD_SAMPLES)
             for n in lengths
         ]
-    return items
+    return result
 
 
 def _round(value: float) -> float:

@@ -65,18 +65,16 @@ def experiments_of(
         )
     problems.raise_if_any()
     clean = [[_cleaned(model, s) for s in part] for part in parts]
-    clean = [[items for s in part for items in _cut(model, *s)] for part in clean]
+    clean = [[pair for s in part for pair in _cut(model, *s)] for part in clean]
     shadows = [[_shadow(model, s) for s, _ in part] for part in clean]
     split = divided(*shadows) if judged else tuple(whole(r) for r in shadows[0])
-    records = cast("Sequence[Any]", [items for part in clean for items in part])
+    records = cast("Sequence[Any]", [pair for part in clean for pair in part])
     values: dict[str, float] = {}  # first instants: a part of a record may start later
     for s, _ in records:
         values[s.sha256] = min(s.time[0], values.get(s.sha256, np.inf))
     result = [
-        replace(
-            e, record=s, known_start=known_start and not later, later_part=later, remarks=statement
-        )
-        for e, (s, statement) in zip(split, records, strict=True)
+        replace(e, record=s, known_start=known_start and not later, later_part=later, remarks=notes)
+        for e, (s, notes) in zip(split, records, strict=True)
         for later in [s.time[0] > values[s.sha256]]
     ]
     channels = []
@@ -95,23 +93,23 @@ def experiments_of(
 
 
 def _cut(
-    model: Model, s: Signals, statement: tuple[Note | str, ...]
+    model: Model, s: Signals, notes: tuple[Note | str, ...]
 ) -> list[tuple[Signals, tuple[Note | str, ...]]]:
     """Return the parts of signals between gaps that hide a motion of an input that is no stairs."""
     parts, cut = without_gaps([s], model.input_names if s.hold == "linear" else ())
-    return [(p, () if k else (*statement, *cut)) for k, p in enumerate(parts)]
+    return [(p, () if k else (*notes, *cut)) for k, p in enumerate(parts)]
 
 
 def _cleaned(model: Model, s: Signals) -> tuple[Signals, tuple[Note | str, ...]]:
     """Return signals without the samples that an output's sensor has made, and what these are."""
     inputs = {n: s.columns[n] for n in model.input_names}
-    columns, statement = dict(s.columns), list[Note]()
+    columns, notes = dict(s.columns), list[Note]()
     for o in model.structure.outputs:
         if o.name in columns:
             suspects = suspects_of(o.name, columns[o.name], o.unit, inputs)
             columns[o.name] = np.where(suspects.mask, np.nan, columns[o.name])
-            statement += suspects.notes(f"{o.name} of {s.name}")
-    return replace(s, columns=columns), tuple(statement)
+            notes += suspects.notes(f"{o.name} of {s.name}")
+    return replace(s, columns=columns), tuple(notes)
 
 
 def varied(model: Model, e: Experiment) -> str | None:
@@ -145,7 +143,7 @@ def column_notes(model: Model, experiments: Sequence[Experiment]) -> tuple[Note 
             for n in absent
         ),
         *units,
-        *(statement for e in experiments for statement in e.remarks),
+        *(remark for e in experiments for remark in e.remarks),
     )
 
 
@@ -157,14 +155,14 @@ def _units(model: Model) -> dict[str, str]:
 def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
     """Return the same samples in the units of a model; where that states none, in SI units."""
     columns, units, where = dict(s.columns), dict(s.units), s.source or s.name
-    for name, item in _units(model).items():
+    for name, target in _units(model).items():
         unit = s.units.get(name)
         if not unit or name not in columns:
             continue
         try:
             read = parse_unit(unit)
-            if item != "1" or read.dimension == parse_unit(item).dimension:
-                columns[name], units[name] = convert(columns[name], unit, item), item
+            if target != "1" or read.dimension == parse_unit(target).dimension:
+                columns[name], units[name] = convert(columns[name], unit, target), target
             elif read.ratio != 1 or read.offset:
                 problems.add(
                     f"{where}: column '{name}' is in '{unit}', of which the model '{model.name}'"
@@ -173,7 +171,7 @@ def in_units(model: Model, s: Signals, problems: Problems) -> Signals:
                 )
         except InputError as error:
             problems.add(
-                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{item}'."
+                f"{where}: column '{name}': {error} The model '{model.name}' has it in '{target}'."
             )
     return replace(s, columns=columns, units=units)
 

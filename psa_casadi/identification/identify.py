@@ -106,8 +106,8 @@ def identify(
     every = [r for r, _ in ready]
     fitted, long = excerpts(every)
     known = {r.sha256: r for r in parts}
-    items = [*cut, *(s for _, item in ready for s in item), *long]
-    refuse_few(given_records, fitted, texts(tuple(items)))
+    notes = [*cut, *(s for _, done in ready for s in done), *long]
+    refuse_few(given_records, fitted, texts(tuple(notes)))
     start, inputs = chosen_start(every, model, stiffness)
     columns = columns_of(start, fitted)
     forms = forms_of(columns.model, hysteresis)
@@ -121,7 +121,7 @@ def identify(
     result, preferred = search_forms(
         forms, experiments, linear=linear, thorough=True, progress=progress
     )
-    best, experiments = _on_even_clock(*relevelled(result.best, experiments), items)
+    best, experiments = _on_even_clock(*relevelled(result.best, experiments), notes)
     best = _with_record_levels(best, experiments, progress)
     if best.interrupted:
         current_work().wrap_up()
@@ -166,7 +166,7 @@ def identify(
         ),
         starts=result.starts,
         notes=(
-            *items,
+            *notes,
             *((preferred,) if preferred else ()),
             *columns.left_out,
             *(" ".join(texts(f.notes)) for f in best.further),
@@ -192,10 +192,10 @@ def with_provenance(
     c_p = model.values.get("C_p", 0.0)
     current = capacitance_of(records)
     fits = current is not None and current.source == "current" and current.is_that_of(c_p)
-    output = {"C_p": current.interval} if current is not None and fits else {}
+    measured = {"C_p": current.interval} if current is not None and fits else {}
     return replace(
         with_origin(
-            model, records, result.names, {**output, **result.intervals},
+            model, records, result.names, {**measured, **result.intervals},
             force_scale="given" if stiffness_given else "assumed",
             interrupted=interrupted,
             notes=(
@@ -219,14 +219,14 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
 
 
 def _on_even_clock(
-    best: Fit, experiments: tuple[Experiment, ...], statement: list[Note | str]
+    best: Fit, experiments: tuple[Experiment, ...], notes: list[Note | str]
 ) -> tuple[Fit, tuple[Experiment, ...]]:
     """Fit samples at even times where the data say that the stamps jitter."""
     even = None if best.interrupted else even_clock(best, experiments)
     if even is not None:
         again = refit(best, even[0])
         if again.rms < best.rms:
-            statement.append(even[1])
+            notes.append(even[1])
             return again, even[0]
     return best, experiments
 

@@ -51,7 +51,8 @@ def read_otherwise(
     noisy readings, or through smoothed ones. The same fit if it was interrupted.
     """
     best, read, notes = of, tuple(experiments), list[Note]()
-    for change in () if of.interrupted else (held_otherwise, _smoothed_instead)[not undecided :]:
+    changes = (held_otherwise, _smoothed_instead) if undecided else (_smoothed_instead,)
+    for change in () if of.interrupted else changes:
         if other := change(best, read):
             best, read, why = other
             notes.append(why)
@@ -207,11 +208,11 @@ def even_clock(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
     """
     even = [_evened(e.record) for e in experiments]
     held = None
-    if any(item is not e.record for item, e in zip(even, experiments, strict=True)):
+    if any(record is not e.record for record, e in zip(even, experiments, strict=True)):
         held = _held(fit, experiments, _of_even)
     if held is None:
         return None
-    moved = tuple(replace(e, record=item) for e, item in zip(experiments, even, strict=True))
+    moved = tuple(replace(e, record=record) for e, record in zip(experiments, even, strict=True))
     late = np.concatenate(
         [new.record.time - e.record.time for new, e in zip(moved, experiments, strict=True)]
     )

@@ -99,7 +99,7 @@ def search_starts(
     can be simulated.
     """
     sigma = [experiments[0].channels[0].level] * len(experiments)
-    observed = observed_starts(model, experiments)
+    states = observed_starts(model, experiments)
     rng, declared = np.random.default_rng(_SEED), model.values
     points: list[tuple[str, dict[str, float]]] = [("declared values", {})]
     for k in range(1, starts):
@@ -109,7 +109,7 @@ def search_starts(
     def quick(name: str, values: Mapping[str, float]) -> Fit:
         progress(f"fit from {name}")
         return fit(
-            model.with_values(values), experiments, free, sigma=sigma, start_states=observed,
+            model.with_values(values), experiments, free, sigma=sigma, start_states=states,
             evaluations=_QUICK if starts > 1 else 3 * _QUICK,
             tolerance=1e-4 if starts > 1 else 1e-6,
         )  # fmt: skip

@@ -62,33 +62,33 @@ def identify_ode(
     signals = given_to(model, records, hold)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
-    *_, (best, runs, outcomes, statement) = ways(
+    *_, (best, runs, outcomes, notes) = ways(
         model, signals,
         lambda length: experiments_of(
             model, cut(model, signals, length), judged=False, zeros=shifted, known_start=known_start
         ),
         free_of(model, free), undecided=undecided(records, hold), starts=starts, progress=progress,
     )  # fmt: skip
-    matches = determinacy(best, runs)
+    determined = determinacy(best, runs)
     result = Identification(
         model=with_origin(
-            best.model, [e.record for e in runs], matches.names, matches.intervals,
+            best.model, [e.record for e in runs], determined.names, determined.intervals,
             force_scale="given", interrupted=best.interrupted,
         ),
         fit=best,
-        determinacy=matches,
+        determinacy=determined,
         experiments=runs,
         doubts=(),
         starts=outcomes,
         interrupted=best.interrupted,
     )  # fmt: skip
     doubts = (
-        *doubts_of(best, matches, outcomes),
+        *doubts_of(best, determined, outcomes),
         *_of_outputs(result),
         *column_notes(model, runs),
     )
     noise = () if best.interrupted else noise_found(best, runs, signals)
-    return replace(result, doubts=doubts, notes=(*statement, *notes_of(noise)), noise_kinds=noise)
+    return replace(result, doubts=doubts, notes=(*notes, *notes_of(noise)), noise_kinds=noise)
 
 
 def _of_outputs(identification: Identification) -> list[Note]:

@@ -53,9 +53,9 @@ def prepared(record: Record) -> tuple[Record, tuple[Note | str, ...]]:
     """
     result = suspects(record)
     clean, clocks = on_one_clock(cleaned(record, result))
-    statement: tuple[Note | str, ...] = (*result.notes(record.name), *clocks)
+    notes: tuple[Note | str, ...] = (*result.notes(record.name), *clocks)
     shorter, averages = _averaged(clean)
-    return shorter, (*statement, *averages)
+    return shorter, (*notes, *averages)
 
 
 def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
@@ -66,7 +66,7 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
     if sum(r.n for r in records) <= MOST:
         return list(records), []
     ready = [_averaged(r) for r in records]
-    return [r for r, _ in ready], [s for _, statement in ready for s in statement]
+    return [r for r, _ in ready], [s for _, notes in ready for s in notes]
 
 
 def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
@@ -99,29 +99,29 @@ def columns_of(model: Model, records: Sequence[Record]) -> Columns:
 
     Raises InputError for a column that the model cannot give, or that has samples missing.
     """
-    fitted, statement, problems = [], [], []
-    for column, displayed in COLUMNS.items():
-        items = [r for r in records if getattr(r, column) is not None]
-        if not items:
+    fitted, notes, problems = [], [], []
+    for column, channel in COLUMNS.items():
+        having = [r for r in records if getattr(r, column) is not None]
+        if not having:
             continue
         wider, sensor = model, SENSORS.get(column)
         if sensor is not None and sensor.name not in (c.name for c in model.components):
             with suppress(InputError):  # where that finds nothing to show
                 wider = model.with_components((*model.components, sensor))
-        missing = [o for o in displayed.outputs if o not in wider.output_names]
+        missing = [o for o in channel.outputs if o not in wider.output_names]
         if missing:
             problems.append(
                 f"The records have the column '{column}', but the model '{model.name}' does not"
                 f" give it (it has no {missing[0]}); leave the column out, or give a model with it."
             )
-        elif why := _useless(column, items):
-            statement.append(note(why, column=column))
+        elif why := _useless(column, having):
+            notes.append(note(why, column=column))
         else:
             model = wider
             fitted.append(column)
     if problems:
         raise InputError(problems)
-    return Columns(model, tuple(fitted), tuple(statement))
+    return Columns(model, tuple(fitted), tuple(notes))
 
 
 def with_levels(
@@ -130,8 +130,8 @@ def with_levels(
     """Return the experiments with first noise levels of the columns that are fitted."""
     levels = []
     for column in columns:
-        items = [e for e in experiments if e.record.column(column) is not None and e.used.any()]
-        values = [getattr(e.record, column)[e.used] for e in items]
+        having = [e for e in experiments if e.record.column(column) is not None and e.used.any()]
+        values = [getattr(e.record, column)[e.used] for e in having]
         if values:
             noise = max(fast_noise(v) for v in values)
             spread = max(float(np.std(v)) for v in values)

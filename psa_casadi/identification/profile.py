@@ -191,8 +191,8 @@ def profile(
     first = spread / estimate if held.log else spread  # one standard error
     first = float(np.clip(first, 1e-6 * ordinary, ordinary))
     below, above = (held.side(centre, sign * first, points) for sign in (-1.0, 1.0))
-    items = [*below[::-1], centre, *above]
-    z, cost = (np.array([of(p) for p in items]) for of in (held.z, lambda p: p.cost))
+    fits = [*below[::-1], centre, *above]
+    z, cost = (np.array([of(p) for p in fits]) for of in (held.z, lambda p: p.cost))
     level: FloatArray = np.sqrt((cost - cost.min()) / held.limit)
     least = int(np.argmin(cost))
     ends = [

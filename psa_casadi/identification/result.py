@@ -149,16 +149,16 @@ def doubts_of(
 
     `not_unique` names parameters that equally good fits differ in.
     """
-    items = []
+    doubts = []
     if fit.interrupted or not fit.converged:
-        items.append(note("interrupted" if fit.interrupted else "cut_off"))
+        doubts.append(note("interrupted" if fit.interrupted else "cut_off"))
     if not_unique:
-        items.append(note("not_unique", names=not_unique))
+        doubts.append(note("not_unique", names=not_unique))
     elif len(starts) > 1 and sum(bool(s.agrees) for s in starts) == 1:
-        items.append(note("one_start", starts=len(starts)))
-    items += [note("on_bound", name=name) for name in determinacy.on_bound]
+        doubts.append(note("one_start", starts=len(starts)))
+    doubts += [note("on_bound", name=name) for name in determinacy.on_bound]
     alone = [n for n in determinacy.undetermined if n not in not_unique]
-    return [*items, note("undetermined", names=alone)] if alone else items
+    return [*doubts, note("undetermined", names=alone)] if alone else doubts
 
 
 def with_origin(

@@ -225,12 +225,12 @@ def _outliers(findings: Sequence[Finding], spreads: Sequence[Spread]) -> tuple[O
         for k, z, p in zip(s.estimates.places, s.far.z, s.far.p, strict=True)
     ]
     corrected = adjusted([p for *_, p in tests])
-    items = [
+    result = [
         Outlier(device, name, z, float(c))
         for (device, name, z, _), c in zip(tests, corrected, strict=True)
         if c < LIMIT
     ]
-    return tuple(sorted(items, key=lambda o: -abs(o.z)))
+    return tuple(sorted(result, key=lambda o: -abs(o.z)))
 
 
 def _over_parameters(p_values: dict[str, float]) -> dict[str, float]:

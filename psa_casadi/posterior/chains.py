@@ -244,10 +244,10 @@ def data_tree(
     _, arviz = sampler_and_arviz()
     draws, before = quantities(task, theta), quantities(task, prior.theta[None])
     observed, applied, times = _recorded(task)
-    output, blocks = _units(task), task.density.blocks
-    dims = {n: [_RECORD] for n in output if n not in task.unknowns.names}
+    units, blocks = _units(task), task.density.blocks
+    dims = {n: [_RECORD] for n in units if n not in task.unknowns.names}
     for name, (time, _, unit, meaning) in (observed | applied).items():
-        dims[name], output[name], output[time] = [time], (unit, meaning), ("s", "Time")
+        dims[name], units[name], units[time] = [time], (unit, meaning), ("s", "Time")
     predictions = []
     for p in (posterior, prior):
         table = {column_of(task, b): y[None] for b, y in zip(blocks, p.readings, strict=True)}
@@ -268,7 +268,7 @@ def data_tree(
     )
     for group in tree.groups():
         for name in tree[group].variables:
-            unit, meaning = output.get(name, ("", ""))
+            unit, meaning = units.get(name, ("", ""))
             if unit:
                 tree[group][name].attrs |= {"units": unit, "long_name": meaning}
     tree.posterior.attrs["inference_library"] = "nutpie"
@@ -289,13 +289,13 @@ def _recorded(task: Task) -> tuple[_Columns, _Columns, dict[str, FloatArray]]:
         first = next((column_of(task, b) for b in task.of_record(k)), "")
         for b in task.of_record(k):
             times[f"time_{first}"], c = e.record.time, task.channel(b)
-            output = e.measured(b.channel), c.unit, c.column
-            columns[column_of(task, b)] = (f"time_{first}", *output)
+            column = e.measured(b.channel), c.unit, c.column
+            columns[column_of(task, b)] = (f"time_{first}", *column)
         for inputs in task.model.structure.inputs:
             values = e.record.column(inputs.name)
             if first and values is not None:
-                output = values, inputs.unit, inputs.description
-                applied[f"{inputs.name}_{first}"] = (f"time_{first}", *output)
+                column = values, inputs.unit, inputs.description
+                applied[f"{inputs.name}_{first}"] = (f"time_{first}", *column)
     return columns, applied, times
 
 
@@ -307,8 +307,8 @@ def quantities(task: Task, theta: FloatArray) -> dict[str, FloatArray]:
     table = {n: np.array([r[n] for r in rows]).reshape(shape) for n in u.names}
     starts = [[u.start(t, k) for k in range(u.records)] for t in flat]
     for name in _states(u):
-        items = [[s.get(name, np.nan) for s in each] for each in starts]
-        table[f"start_{name}"] = np.array(items).reshape(*shape, u.records)
+        values = [[s.get(name, np.nan) for s in each] for each in starts]
+        table[f"start_{name}"] = np.array(values).reshape(*shape, u.records)
     first = task.experiments[0].channels[0]
     if first.offset:
         offsets = [[u.offset(t, k) for k in range(u.records)] for t in flat]

@@ -117,7 +117,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
         tree, var_names=list(task.unknowns.names), hdi_prob=HDI, round_to="none", kind="all"
     )
     edge, u = 50.0 * (1.0 - HDI), task.unknowns
-    items = []
+    figures = []
     for k, name in enumerate(u.names):
         row, values = table.loc[name], tree.posterior[name].to_numpy()
         if u.loop is not None and k in u.loop:
@@ -126,7 +126,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
         else:  # in ln units where these are searched
             moved = np.log(values) if u.log[k] else values / u.scale[k]
             share = float(np.std(moved) / u.prior[k])
-        items.append(
+        figures.append(
             Figures(
                 name=name,
                 unit=task.model.parameter(name).unit,
@@ -140,7 +140,7 @@ def figures_of(task: Task, tree: Any) -> tuple[Figures, ...]:
                 prior_share=share,
             )
         )
-    return tuple(items)
+    return tuple(figures)
 
 
 def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple[Note, ...]:

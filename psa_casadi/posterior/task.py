@@ -131,8 +131,8 @@ class Density:
             residual, jacobian = result
             value, pull, rest = 0.0, residual.copy(), residual.copy()
             for block in self.blocks:
-                item = residual[block.rows]
-                power = float(item @ item)
+                rows = residual[block.rows]
+                power = float(rows @ rows)
                 value -= 0.5 * block.count * float(np.log(power))
                 pull[block.rows] *= block.count / power
                 rest[block.rows] = 0.0
@@ -192,7 +192,7 @@ def task_of(
     and `widths` their standard deviations, in ln units for parameters that span decades, else in
     ordinary changes. Raises InputError, SimulationError.
     """
-    parts, statement = without_gaps(list(records))
+    parts, notes = without_gaps(list(records))
     ready = [prepared(r) for r in parts]
     fitted = [r for r, _ in ready]
     columns = columns_of(model.with_declared_starts(), fitted)
@@ -203,7 +203,7 @@ def task_of(
     return _around(
         centre, experiments, {n: columns.model.values[n] for n in names}, widths or {},
         noise_levels(experiments), None,
-        (*statement, *(s for _, item in ready for s in item), *columns.left_out),
+        (*notes, *(s for _, done in ready for s in done), *columns.left_out),
     )  # fmt: skip
 
 
@@ -226,12 +226,12 @@ def own_task_of(
     identification = identify_ode(model, records, free=names, **words)
     if identification.fit.interrupted:
         raise KeyboardInterrupt
-    output = identification.fit.model
-    declared = {n: output.parameter(n).value for n in names}
+    fitted = identification.fit.model
+    declared = {n: fitted.parameter(n).value for n in names}
     return _around(
-        output.with_values({**declared, **(prior or {})}),
+        fitted.with_values({**declared, **(prior or {})}),
         weighted(identification.fit, identification.experiments),
-        {n: output.values[n] for n in names},
+        {n: fitted.values[n] for n in names},
         widths or {},
         identification.fit.sigma,
         identification.fit,
@@ -272,13 +272,13 @@ def _around(
             raise KeyboardInterrupt
         theta, weights = result.theta, weights_of(experiments, sigma)
         ends = np.cumsum([e.at(0).sum() for e in experiments])
-        item = np.split(result.residual[: len(weights)] * weights, ends[:-1])
+        residuals = np.split(result.residual[: len(weights)] * weights, ends[:-1])
         sigma = [
             max(float(np.sqrt(np.mean(r**2))), 1e-15) if r.size else s
-            for r, s in zip(item, sigma, strict=True)
+            for r, s in zip(residuals, sigma, strict=True)
         ]
-        displayed = predict(centre, experiments, unknowns, theta, way=way, further=True)
-        levels = [f.relevelled() for f in further_of(experiments, displayed)]
+        predictions = predict(centre, experiments, unknowns, theta, way=way, further=True)
+        levels = [f.relevelled() for f in further_of(experiments, predictions)]
         experiments = tuple(e.with_further(levels) for e in experiments)
     return _task(centre, tuple(experiments), unknowns, result, way, sigma, sentences)
 
@@ -337,17 +337,17 @@ def _task(
     for j, channel in enumerate(experiments[0].channels):
         for r, e in enumerate(experiments):
             first, last = last, last + int(e.at(j).sum())
-            rows, item = slice(first, last), residual[first:last]
+            rows, part = slice(first, last), residual[first:last]
             if first == last:
                 continue
             time, projected = 1.0, float(j > 0 and channel.offset)
             if not channel.factors:
-                lags = autocovariance(item)
+                lags = autocovariance(part)
                 ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
                 time = max(1.0, ratio)
                 level = (channel.level if j else sigma[r]) * e.share(j)
-                level *= float(np.sqrt(np.mean(item**2)))
-                blocks.append(Block(rows, (len(item) - projected) / time, r, j, time, level))
+                level *= float(np.sqrt(np.mean(part**2)))
+                blocks.append(Block(rows, (len(part) - projected) / time, r, j, time, level))
             precision += jacobian[rows].T @ jacobian[rows] / time
     rest = jacobian[last:]
     precision += rest.T @ rest

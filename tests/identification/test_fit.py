@@ -37,11 +37,9 @@ def model_with(*effects: str) -> Model:
 def record_of(model: Model, seed: int, samples: int = 400) -> Record:
     time = time_grid(2e-3 * samples, 2e-3)
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
-    x = simulate(model, time, voltage).displacement
-    white = np.random.default_rng(seed).standard_normal(samples)
-    return Record(
-        name=f"r{seed}", time=time, voltage=voltage, displacement=x + 1e-6 * seed + SIGMA * white
-    )
+    white = SIGMA * np.random.default_rng(seed).standard_normal(samples)
+    x = simulate(model, time, voltage).displacement + 1e-6 * seed + white
+    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
 
 
 def moved(unknowns: Unknowns, seed: int) -> FloatArray:
@@ -157,13 +155,9 @@ def _after_a_history(model: Model, peak: float, seed: int) -> Record:
     again = 20.0 + 25.0 * (1.0 - np.cos(2.0 * np.pi * (time - 2.0))) * (time / 4.0)
     voltage = np.where(before, down, again)
     x = simulate(model, time, voltage).displacement
-    noise = SIGMA * np.random.default_rng(seed).standard_normal(time.size)
-    return Record(
-        name=f"h{seed}",
-        time=time[~before] - time[~before][0],
-        voltage=voltage[~before],
-        displacement=(x + noise)[~before],
-    )
+    x = x + SIGMA * np.random.default_rng(seed).standard_normal(time.size)
+    t, v, y = (column[~before] for column in (time, voltage, x))
+    return Record(name=f"h{seed}", time=t - t[0], voltage=v, displacement=y)
 
 
 def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> None:

@@ -11,7 +11,7 @@ from psa_casadi.effects import EFFECTS
 from psa_casadi.errors import InputError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.profile import PROFILE_LIMIT, profile
+from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
@@ -34,12 +34,8 @@ def record_of(model: Model, seed: int, noise: float = SIGMA) -> Record:
     time = time_grid(400 * SAMPLE, SAMPLE)
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
     x = simulate(model, time, voltage).displacement
-    return Record(
-        name=f"r{seed}",
-        time=time,
-        voltage=voltage,
-        displacement=x + noise * coloured(seed, len(time)),
-    )
+    x = x + noise * coloured(seed, len(time))
+    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
 
 
 def coloured(seed: int, count: int) -> FloatArray:
@@ -56,17 +52,21 @@ def fitted(*free: str, noise: float = SIGMA) -> tuple[Fit, list[Experiment]]:
     return fit(plant(), experiments, free, sigma=[SIGMA]), experiments
 
 
+def ends(p: Profile) -> tuple[float, float]:
+    """Return both ends of a closed interval."""
+    assert p.low is not None
+    assert p.high is not None
+    return p.low, p.high
+
+
 @pytest.mark.parametrize("name", ["k_L", "tau", "beta", "n"])
 def test_where_the_cost_is_quadratic_it_is_the_linearised_interval(name: str) -> None:
     result, experiments = fitted("k_L", "A", "beta", "gamma", "n", "tau")
     p = profile(result, experiments, name)
     linear = determinacy(result, experiments).intervals[name]
-    assert p.low is not None
-    assert p.high is not None
-    assert p.high - p.low == pytest.approx(linear.high - linear.low, rel=0.1)
-    assert 0.5 * (p.high + p.low) == pytest.approx(
-        0.5 * (linear.high + linear.low), abs=0.05 * (linear.high - linear.low)
-    )
+    (low, high), width = ends(p), linear.high - linear.low
+    assert high - low == pytest.approx(width, rel=0.1)
+    assert high + low == pytest.approx(linear.high + linear.low, abs=0.1 * width)
     assert p.estimate == result.model.values[name]
     assert np.all(np.diff(p.values) > 0)
     assert p.increase.min() == 0.0
@@ -77,10 +77,8 @@ def test_residuals_above_the_weights_widen_it() -> None:
     widths = []
     for noise in (SIGMA, 3.0 * SIGMA):
         result, experiments = fitted("k_L", "tau", noise=noise)
-        p = profile(result, experiments, "tau")
-        assert p.low is not None
-        assert p.high is not None
-        widths.append(p.high - p.low)
+        low, high = ends(profile(result, experiments, "tau"))
+        widths.append(high - low)
     assert widths[1] == pytest.approx(3.0 * widths[0], rel=0.1)
 
 
@@ -91,13 +89,8 @@ def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
     assert p.high is not None
 
     def grown(value: float) -> float:
-        held = fit(
-            result.model.with_values({"R_s": value}),
-            experiments,
-            ("k_L", "tau"),
-            sigma=result.sigma,
-            start_states=[result.start(0)],
-        )
+        model, starts = result.model.with_values({"R_s": value}), [result.start(0)]
+        held = fit(model, experiments, ("k_L", "tau"), sigma=result.sigma, start_states=starts)
         return held.cost - result.cost
 
     unit = grown(float(p.values[-1])) / p.increase[-1]
@@ -108,10 +101,9 @@ def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
 
 def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
     """The time constant of a creep of gain 0 changes nothing."""
-    model = plant().with_effect(EFFECTS["slow_creep"])
-    free = next(
-        q.name for q in EFFECTS["slow_creep"].parameters if q.name != EFFECTS["slow_creep"].gain
-    )
+    creep = EFFECTS["slow_creep"]
+    model = plant().with_effect(creep)
+    free = next(q.name for q in creep.parameters if q.name != creep.gain)
     experiments = [whole(record_of(plant(), 1))]
     result = fit(model, experiments, ("k_L", free), sigma=[SIGMA])
     p = profile(result, experiments, free)
@@ -169,9 +161,7 @@ def test_sentence_and_plot_show_profile_limit_and_interval() -> None:
     np.testing.assert_allclose(plot.data[0]["y"], closed.increase)
     line, interval = plot.layout["shapes"]
     assert line["y0"] == line["y1"] == PROFILE_LIMIT
-    assert closed.low is not None
-    assert closed.high is not None
-    assert (interval["x0"], interval["x1"]) == pytest.approx((1e3 * closed.low, 1e3 * closed.high))
+    assert (interval["x0"], interval["x1"]) == pytest.approx([1e3 * x for x in ends(closed)])
     # where the cost is quadratic the dotted parabola passes through the profile's points
     parabola = np.interp(plot.data[0]["x"], plot.data[1]["x"], plot.data[1]["y"])
     np.testing.assert_allclose(parabola, closed.increase, atol=0.3)

@@ -105,9 +105,9 @@ _UNITS = {3: ("s", "ms"), 6: ("s", "us"), 9: ("s", "ns"),
 
 def refuse_other_time(records: Sequence[Record]) -> None:
     """Raise InputError where a stack would move faster than sound lets it, or never but creep."""
-    text = _faster(records, FASTEST)
-    if text:
-        raise InputError(text)
+    reason = _faster(records, FASTEST)
+    if reason:
+        raise InputError(reason)
     fastest = max((_paces(r)[1] for r in records if np.ptp(r.voltage) > 0.0), default=1.0)
     if fastest < 1.0 / SLOWEST:
         raise InputError(
@@ -324,7 +324,7 @@ def refuse_unusable(records: Sequence[Record]) -> None:
 
 def stray(records: Sequence[Record]) -> list[str]:
     """Name the few samples of a record that lie far from all others, in voltage or displacement."""
-    items = []
+    sentences = []
     for r in records:
         columns = [("voltage", "V", r.voltage), ("displacement", "m", measured(r))]
         for name, unit, column in columns:
@@ -333,12 +333,12 @@ def stray(records: Sequence[Record]) -> list[str]:
                 continue
             rest = np.delete(column, far)
             where = ", ".join(f"{column[k]:.3g} {unit} at {r.time[k]:.6g} s" for k in far)
-            items.append(
+            sentences.append(
                 f"Record '{r.name}': the {name} is {where}, and all others lie within"
                 f" {np.nanmin(rest):.3g} to {np.nanmax(rest):.3g} {unit}: correct or remove"
                 f" {'this sample' if far.size == 1 else 'these samples'}."
             )
-    return items
+    return sentences
 
 
 def _far(column: FloatArray) -> NDArray[np.intp]:
@@ -426,7 +426,7 @@ def _suggestion(stroke: float, span: float) -> str:
         and ORDINARY_STROKE[0] <= x / v <= ORDINARY_STROKE[1]
     ]
     power = min(fits, key=lambda p: abs(p[0]) + abs(p[1]), default=(0, 0))
-    items = [
+    changes = [
         f"the {name} is in {units[p]} (or in units as far apart): correct the header, or give"
         f" --columns {name}=NAME:{units[p].split(',')[0]}"
         for name, p, units in (
@@ -434,4 +434,4 @@ def _suggestion(stroke: float, span: float) -> str:
         )
         if p
     ]  # fmt: skip
-    return f". Perhaps {' and '.join(items)}" if items else ""
+    return f". Perhaps {' and '.join(changes)}" if changes else ""

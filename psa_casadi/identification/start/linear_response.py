@@ -167,20 +167,20 @@ def orthonormal(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _apart(poles: ComplexArray) -> ComplexArray:
     """Return the poles in conjugate pairs, each about `_APART` or more from every other."""
-    item: list[complex] = []
+    complex_poles: list[complex] = []
     real: list[float] = []
     for pole in poles[poles.imag >= 0]:
         size, moved = abs(pole), complex(pole)
         if pole.imag > _APART * size:
-            while any(abs(moved - other) < _APART * size for other in item):
+            while any(abs(moved - other) < _APART * size for other in complex_poles):
                 moved *= 1.0 + _APART
-            item += [moved, moved.conjugate()]
+            complex_poles += [moved, moved.conjugate()]
         else:
             real += [log(size), log(size)] if pole.imag else [log(size)]
     real.sort()
     for k in range(1, len(real)):
         real[k] = max(real[k], real[k - 1] + _APART)
-    return np.array([*item, *(-exp(place) for place in real)], dtype=np.complex128)
+    return np.array([*complex_poles, *(-exp(place) for place in real)], dtype=np.complex128)
 
 
 _ROUNDS = 10

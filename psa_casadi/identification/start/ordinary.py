@@ -143,8 +143,8 @@ def _by_current(records: Sequence[Record], total: float) -> Capacitance:
 
 def _by_charge(records: Sequence[Record]) -> Capacitance | None:
     """Return the charge per volt, every record about its mean; None without a charge."""
-    items = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
-    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in items]
+    columns = [(r.voltage, np.asarray(r.charge)) for r in records if r.charge is not None]
+    pairs = [(v - np.mean(v), q - np.mean(q)) for v, q in columns]
     power = sum(float(v @ v) for v, _ in pairs)
     total = sum(float(q @ q) for _, q in pairs)
     if power == 0.0 or total == 0.0:

@@ -552,9 +552,9 @@ def placed(
         share = contributions(response, poles)
         least = min(1.0, share.max())
         for level in {least, share.max()} if weak else {least}:
-            for item in arrangements(poles[share >= _COUNTS * level], e.h):
+            for theta in arrangements(poles[share >= _COUNTS * level], e.h):
                 for ratio in ratios:
-                    yield np.append(item, ratio)
+                    yield np.append(theta, ratio)
 
 
 def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
@@ -568,19 +568,19 @@ def arrangements(poles: ComplexArray, interval: float) -> list[FloatArray]:
     tones = sorted((p for p in poles if p.imag > 0), key=abs)
     fast = max(0.3 * min([1.0 / abs(p) for p in poles]), 0.25 * interval)
     pairs = [(-2.0 * p.real / abs(p) ** 2, 1.0 / abs(p) ** 2) for p in tones[:2]]
-    items = []
+    result = []
     for lags in (2, 1) if len(times) > 1 else (2,):
-        item = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
+        slow = [*times, fast, fast][:lags] + [0.5 * fast] * (2 - lags)
         left = times[lags:]
         both = list(pairs)
         while len(both) < 2:
             one, two = [*left, fast, 0.7 * fast][:2]
             left = left[2:]
             both.append((one + two, one * two))
-        for tau, drive in {(item[0], item[1]), (item[1], item[0])}:
+        for tau, drive in {(slow[0], slow[1]), (slow[1], slow[0])}:
             for b, p in {(both[0], both[1]), (both[1], both[0])}:
-                items.append(np.log([drive, tau, *p, *b]))
-    return items
+                result.append(np.log([drive, tau, *p, *b]))
+    return result
 
 
 #: Candidate dynamics that miss the fast records this much more than the best are not tried.

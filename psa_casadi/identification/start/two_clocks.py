@@ -102,11 +102,11 @@ class Delays:
         removed = self._fitted(line)[2] - left
         if removed < _CLEAR * scatter or smooth - left < _SHARPER * scatter:
             return False
-        items = []
+        similar = []
         for half in (along < 0.5, along >= 0.5):
             height, variance, left = self._fitted(np.column_stack([saw, one]), half)
             deviation = (left / max(half.sum() - 2, 1) * variance) ** 0.5
-            items.append(self._alike(height, deviation, beat, _HALF))
+            similar.append(self._alike(height, deviation, beat, _HALF))
         ends = np.arange(ceil(beat.phase), floor(beat.phase + beat.beats) + 1)
         jumps = 0
         for at in (ends - beat.phase) / beat.beats:
@@ -117,9 +117,9 @@ class Delays:
             columns = np.column_stack([along < at, one, along - at])
             height, variance, left = self._fitted(columns, near)
             deviation = (max(scatter, left / (near.sum() - 3)) * variance) ** 0.5
-            items.append(self._alike(height, deviation, beat, _JUMP))
+            similar.append(self._alike(height, deviation, beat, _JUMP))
             jumps += 1
-        return jumps >= _JUMPS and all(items)
+        return jumps >= _JUMPS and all(similar)
 
     def _scanned(self, beats: FloatArray, phases: FloatArray) -> Beat:
         root, along = np.sqrt(self.weight), self.along
@@ -131,11 +131,11 @@ class Delays:
             saws = root[:, None] * ((phases + rate * along[:, None]) % 1.0)
             saws -= line @ (line.T @ saws)
             power = np.maximum(np.sum(saws**2, axis=0), 1e-300)
-            output = saws.T @ wanted
-            k = int(np.argmax(output**2 / power))
-            removed = float(output[k] ** 2 / power[k])
+            projected = saws.T @ wanted
+            k = int(np.argmax(projected**2 / power))
+            removed = float(projected[k] ** 2 / power[k])
             if removed > best[0]:
-                best = removed, Beat(rate, float(phases[k]) % 1.0, float(output[k] / power[k]))
+                best = removed, Beat(rate, float(phases[k]) % 1.0, float(projected[k] / power[k]))
         return best[1]
 
     def _fitted(
