@@ -2,7 +2,7 @@
 
 After each step of the force a resonance rings, and what the samples show of it is a tone below half
 the sampling rate f_s that decays as fast as the resonance itself, whatever its own frequency: one
-at f is seen at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
+at f appears at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
 
     q_k = 2 Re(z) q_(k-1) - |z|^2 q_(k-2) + b_0 (F_k - F_(k-1)) + b_1 (F_(k-1) - F_(k-2)),
     z = exp((-2 pi d + 2 pi i f) / f_s)
@@ -62,12 +62,12 @@ class Ringing:
 
     @property
     def resonances(self) -> tuple[tuple[float, float], ...]:
-        """Frequencies [Hz] with damping ratios that are seen at this tone when sampled."""
+        """Frequencies [Hz] with damping ratios that appear at this tone when sampled."""
         return tuple((f, min(1.0, self.decay / f)) for f in images(self.tone, self.rate, _IMAGES))
 
 
 def images(tone: float, rate: float, most: int) -> list[float]:
-    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
+    """Return what appears at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
 
     At half the sampling rate these are pairs, apart by rounding only.
     """
@@ -171,7 +171,7 @@ def _response(
 #: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
 #: of another effect.
 _AS_GOOD, _LIKE = 10.0, 3.0
-#: To what share of the rms one beside the causes found must lead.
+#: To what share of the rms one added to the causes must lead.
 _MUCH = 0.985
 #: n ln(ratio of rms) by which a fit with resonances must be better to count.
 _CLEAR = 15.0
@@ -180,10 +180,10 @@ _NEAR_IMAGES = 3
 _QUICK, _FIRST, _BEST = 8, 4, 2
 #: How far above what is of use the cost after the first evaluations may be.
 _HOPEFUL = 2.0
-#: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
+#: A search for resonances restarts from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
 #: Sampling rate [Hz] from which a stack's resonances may show though they lie above the band; the
-#: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
+#: decrease of the whitened sum of squares from which ringing is detected, and resonances at most.
 _SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 
 
@@ -191,7 +191,7 @@ _SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
     """Fit the base from resonances and lags that fast records show; None if none explain more.
 
-    Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
+    Ordinary lags lead nowhere for a stack that rings within the record's band. The search starts
     with an ordinary loop and, while it misses something, with that of the base.
     """
     if "k_P" not in base.model.values:
@@ -278,7 +278,7 @@ def rings(effect: Component) -> bool:
 
 
 def _tuned(fit: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    """Return the fit with its mechanics sought again while it rings; k_P is free if determined."""
     left = ringing(fit, experiments)
     if left is None or left.decrease >= SEEN:
         fit = retuned(fit, experiments, progress)

@@ -16,8 +16,8 @@ from psa_casadi.units import FloatArray
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05
 _LARGEST = 0.95
-#: Correlations at which it is asked what a projection leaves, the least share of a difference that
-#: must be left, and the share of directions up to which it is asked at all.
+#: Correlations at which a projection is evaluated, the least share of a difference that
+#: must be left, and the share of directions up to which it is evaluated at all.
 _TRIED, _TOLD, _MANY = (0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.88, _LARGEST), 0.5, 0.25
 
 
@@ -26,7 +26,7 @@ class Colour:
     """Noise e_k = a_1 e_(k-1) + ... + w_k, with w white of standard deviation `level` [m].
 
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
-    records' numbers of samples. `further` are the colours of the columns beside the displacement,
+    records' numbers of samples. `further` are the colours of the columns besides the displacement,
     each with a level in its own unit. The first samples of a record count over the noise's rms, or
     with 0 where a record has no `known_start`; every sample over its `spread` (samples,),
     where the noise is not as large everywhere.
@@ -106,7 +106,7 @@ def colour_of(
 
     `removed` (samples, k) is an orthonormal basis of what was projected out of it: slow directions
     for the most part, which take a colour's slow part along. The correlation is the one that leaves
-    what is seen (`left_correlation`), where that can be told.
+    the observed one (`left_correlation`), where that can be estimated.
 
     `known` holds the autoregression of records whose noise is known without a model (repeats). The
     others share one of first order, estimated from the remainder: it can describe the noise of a

@@ -21,7 +21,7 @@ _DOES: dict[str, Kind] = {
 _PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
 #: The largest probability that is stated.
 SUREST = 0.99
-#: Families less probable than this are not told.
+#: Families less probable than this are not reported.
 _LEAST = 0.01
 
 
@@ -49,7 +49,7 @@ def place_and_kind(c: Correction) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class CauseEvidence:
-    """What a cause has: its evidence E [nats], from n samples, beside which k causes with it."""
+    """What a cause has: its evidence E [nats], from n samples, with k causes in all."""
 
     evidence: float
     samples: int
@@ -59,7 +59,7 @@ class CauseEvidence:
         """Return the probability that it is of any kind that was tried.
 
         The odds of what looks like it, but nobody has thought of or is the form of another cause,
-        are `unknown` k (n/E)^(1/2). The smaller it is beside the noise, the less of its form shows.
+        are `unknown` k (n/E)^(1/2). The smaller it is over the noise, the less of its form shows.
         """
         small = float(np.sqrt(self.samples / max(self.evidence, 1e-300)))
         return 1.0 / (1.0 + limits.unknown * self.causes * small)
@@ -75,9 +75,9 @@ def families(
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; what is `shown` of the cause is over the model without it, beside which the
-    `corrections` stand. With the evidence F_k, above the price of a cause, of each correction and
-    that E of the cause, the odds that it is not listed are
+    families; what is `shown` of the cause is over the model without it, with the `corrections` of
+    that model. With the evidence F_k, above the price of a cause, of each correction and that E of
+    the cause, the odds that it is not listed are
 
         sum_k exp((F_k - E*) / T),   T = max(temperature 2, further E)
 

@@ -62,7 +62,7 @@ def model_of(
 def fit_free_functions(
     view: View, task: Task, base: Model, effects: Sequence[Attached], scale: Scale
 ) -> list[FreeFunction]:
-    """Fit the most telling free functions beside a hypothesis; return them, the best first.
+    """Fit the most significant free functions added to a hypothesis; return them, the best first.
 
     `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
@@ -123,7 +123,7 @@ def _added(
     result: Formula, of: Hypothesis, place: Place, base: Model, effects: Sequence[Attached],
     scale: Scale,
 ) -> FreeFunction:  # fmt: skip
-    """Return a fitted function, and what it adds beside the variable that it follows most."""
+    """Return a fitted function, and what it adds, with the variable that it follows most."""
     h, port, experiments = result.hypothesis, place.port, of.experiments
     s = h.fit.model.structure
     term = result.component.equations(Symbols(s.symbols)).add[port.balance]

@@ -280,7 +280,7 @@ class Slope:
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """One record's residual: its size, the views of it, and what is seen.
+    """One record's residual: its size, the views of it, and the findings.
 
     `rms` [m, or counts] is without the mean `mean`; `floor` is the noise, `excess` the share of the
     power above it. The view named "holds" is None in a record without holds, as is `slope`;
@@ -358,7 +358,7 @@ def _steady(
 ) -> views.Ground:
     """Return the residual without its slow part, if the drive turns often in every bin of time.
 
-    A drift would hide smaller views. Under a slow drive the two cannot be told apart, and the
+    A drift would hide smaller views. Under a slow drive the two cannot be separated, and the
     residual stays as it is.
     """
     if not over_time.significant or drive.turns.size < TURNS * over_time.x.size:

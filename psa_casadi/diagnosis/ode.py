@@ -81,7 +81,7 @@ def diagnose_ode(
     searched by the score of a stack's diagnosis: evidence less 8 nats for every cause, confirmed by
     held-out samples. These are the records `holdout`, else a quarter of every record in blocks.
     `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be;
-    `effects` are components of your own, which are searched beside these: each has a gain and adds
+    `effects` are components of your own, which are searched with these: each has a gain and adds
     a term to a port (`applied_u` of an input u, `rate_x` of a state x, `shown_y` of an output y).
     Other words are those of `identify`. `watch` gets every hypothesis of the search (`Tried`).
 
@@ -175,7 +175,7 @@ class _Way:
     so_far: list[Fit]
 
     def searched(self, texts: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
-        """Return the judge of what is found; parameters may change where the rest leaves much."""
+        """Return the judge of the result; parameters may change where the rest leaves much."""
         fixed = [
             n for n, e in self.table.items() if n in texts or e.component.kind != "changing gain"
         ]
@@ -236,7 +236,7 @@ def _better(new: ModelJudge, old: ModelJudge) -> bool:
 
 
 def _settled(judge: ModelJudge) -> bool:
-    """Whether parts of records would tell no more than a search in them."""
+    """Whether parts of records would show no more than a search in them."""
     if judge.verdict not in _OPEN:
         return settled(judge.final.fit, judge.experiments)
     best = judge.last.fit, judge.experiments
@@ -280,7 +280,7 @@ def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Se
 def _held_instead(
     known: SearchState, base: Fit, task_of: _Tasks
 ) -> tuple[SearchState, tuple[Note, ...]] | None:
-    """Return what is found with inputs the other way between samples, if that is likelier.
+    """Return the result with inputs the other way between samples, if that is likelier.
 
     Looked for where the answer is likelier so, or has straight lines that are late by half a
     sampling interval. A cause counts as much as for the choice itself.
@@ -308,9 +308,9 @@ def _late(base: Fit) -> set[str]:
 
 
 def _of_whole(known: SearchState, task: Task) -> SearchState | None:
-    """Return what was found in parts of records as hypotheses of whole ones.
+    """Return the results of parts of records as hypotheses of whole ones.
 
-    None where what was found does not follow these.
+    None where the result does not follow these.
     """
     best, parts = known.answer, known.task.experiments
     task.progress("fitting the whole records")

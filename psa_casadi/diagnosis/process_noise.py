@@ -6,8 +6,8 @@ Linear about the model's course, with the noise w of one place and white noise v
 
 A Kalman filter turns the residual e of an output into innovations, which are white if that is what
 happened; their likelihood is that of the prediction-error form (Ljung, System Identification, 2nd
-ed. 1999, section 7.4; Kristensen, Madsen and Jorgensen, Automatica 40 (2004) 225). phi tells white
-noise, noise that is correlated over a time, and a walk apart.
+ed. 1999, section 7.4; Kristensen, Madsen and Jorgensen, Automatica 40 (2004) 225). phi separates
+white noise, noise that is correlated over a time, and a walk.
 """
 
 from collections.abc import Mapping, Sequence
@@ -284,7 +284,7 @@ def _first(
 def _tried(of: _Linear, count: int) -> _Noises:
     """Return noises of the first places, and of all powers and times.
 
-    A power is told by the effect on the output.
+    A power is set by the effect on the output.
     """
     places, time = np.arange(count), _TIMES * of.step * len(of.c)
     grid = _Noises(

@@ -72,11 +72,11 @@ _NEAR, _LEAST, _TURNS = 0.1, 0.25, 0.01
 _MORE, _REPEATS = (1.5, 2.0), 1e-3
 #: A test's share of what is left may be larger than what is open.
 _DEAF = 2.0
-#: Verdicts beside which no parameter is asked for; parameters that no healthy record may tell, but
+#: Verdicts with which no parameter is fitted; parameters that no healthy record may determine, but
 #: a change of which shows.
 _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
 #: A parameter has changed where it leaves no more than this share of what has; it replaces causes
-#: where it leaves less than this share of what they do, told from a share of the noise on.
+#: where it leaves less than this share of what they do, from a share of the noise on.
 _REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
 #: Parameters that leave less than so many times the best one explain as much.
 _ALIKE = 1.02
@@ -256,12 +256,12 @@ class Since:
         return replace(method, thresholds=limits)
 
     def concluded(self, method: Method, diagnosed: Diagnosed) -> StackDiagnosis:
-        """Diagnose by a method, and tell what was taken off and which parameter has changed.
+        """Diagnose by a method, and report what was taken off and which parameter has changed.
 
         What is left of no more
         than is open is no change. A parameter takes the place of the causes where it leaves clearly
-        less beside the noise than they do, and a stiffness where it leaves as little; what it
-        leaves is its form. Another that leaves as little is told beside them.
+        less above the noise than they do, and a stiffness where it leaves as little; what it
+        leaves is its form. Another that leaves as little is reported with them.
         """
         result, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
         noise, base, least = result.noise_floor_rms_m, result.base_fit, self.open**2

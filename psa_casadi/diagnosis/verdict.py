@@ -1,8 +1,8 @@
-"""What is said of a stack more than of any model: blind spots, rivals, the next record.
+"""What a diagnosis states of a stack more than of any model: blind spots, rivals, the next record.
 
 What belongs to the sensor or the environment stays out of an exported plant. Where the records
 cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
-So there are two models, and the difference of their plants' displacements is told.
+So there are two models, and the difference of their plants' displacements is reported.
 """
 
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ def next_experiment(
     *,
     doubted: bool,
 ) -> NextExperiment:
-    """Return what to do next; `groups` are effects that only a resonance tells apart."""
+    """Return what to do next; `groups` are effects that only a resonance separates."""
     if verdict == "not_driven":
         return NextExperiment(None, (), (note("correct_columns"),))
     if doubted:
@@ -193,7 +193,7 @@ def diagnosed_model(
     stiffness_given: bool,
     spent: held_out.StackBudget | None = None,
 ) -> Model:
-    """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
+    """Return a model of a diagnosis with its evidence; `spent` is its error's budget."""
     result = determinacy(fit, experiments)
     output = replace(
         evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
@@ -240,7 +240,7 @@ def _share(s: held_out.Share) -> ErrorShare:
 
 
 class StackJudge(Judge):
-    """The judge of a stack: repeats tell its noise, its one output is its displacement."""
+    """The judge of a stack: repeats show its noise, its one output is its displacement."""
 
     def __init__(
         self, steps: Sequence[Step], task: Task, *, scale_given: bool, driven: bool = True
@@ -288,7 +288,7 @@ class StackJudge(Judge):
         return held_out.stack_budget(self.budget, self.experiments, *both, self.floor)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
-        """Return the corrections beside a hypothesis, by columns at the stack's ports."""
+        """Return the corrections of a hypothesis, by columns at the stack's ports."""
         return corrections(of.fit, self.experiments, self.last.screening.colour)
 
     def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
@@ -349,7 +349,7 @@ class StackJudge(Judge):
 
 
 def patched_model(d: Diagnosis) -> Model:
-    """Return the extended model with the unnamed correction fitted beside it, all values free.
+    """Return the extended model with the unnamed correction fitted with it, all values free.
 
     Raises InputError where a diagnosis has none, or one that no component stands for;
     SimulationError where it cannot be simulated.

@@ -75,7 +75,7 @@ def sum_effects(model: Model, port: ports.Port, sizes: Sizes) -> tuple[Attached,
     items = [n for n in ports.seen_by(model, port) if n not in model.input_names]
     ways = [n for n in items if n not in rate and not _way(model, n)[1]]
     losing = rate or [n for n in items if n not in ways]
-    # a hysteresis works along coordinates, else along all that is seen
+    # a hysteresis works along coordinates, else along all variables
     return (
         _constant(at),
         *(make(at, n) for n in losing for make in (_loss, _friction, _drag)),

@@ -1,4 +1,4 @@
-"""Fits of a model with one cause more, one less, or another: from its parent and afresh."""
+"""Fits of a model with one cause more, one less, or another: from its parent and defaults."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -144,9 +144,9 @@ def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
 
 
-#: Evaluations of quick fits beside other causes, of sets afresh, and of one effect afresh that goes
-#: on; of these the best so many of one effect, and of any; there the gain begins at so many
-#: ordinary sizes.
+#: Evaluations of quick fits beside other causes, of sets from default values, and of one effect
+#: that goes on; of these the best so many of one effect, and of any; there the gain begins at so
+#: many ordinary sizes.
 _BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
@@ -223,7 +223,7 @@ def fit_from_default(
 
 
 def fit_any_from_default(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
-    """Fit the effects of the scores afresh; return the best of all."""
+    """Fit the effects of the scores from default values; return the best of all."""
     results = side_by_side(
         lambda d: _from_ordinary(before.fit, before.experiments, d.effect, d.values),
         [score.direction for score in scores],
@@ -244,7 +244,7 @@ def in_place(
     effect: Component,
     goal: float = np.inf,
 ) -> Hypothesis | None:
-    """Fit an effect beside the causes of `less`, where the `whole` has another one.
+    """Fit an effect with the causes of `less`, where the `whole` has another one.
 
     The effect begins with its values in its `item` fit, the rest with those that were `reached`;
     what `reached` does not have stays as in `less`.

@@ -1,4 +1,4 @@
-"""Moves of the search beside one effect more: modes, exchanges, several at once, rivals."""
+"""Moves of the search for more than one effect: modes, exchanges, several at once, rivals."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -82,7 +82,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
 def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """Fit one mode in the place of a series, from each of those, and the best to the end.
 
-    The series is the last cause; `less` is the hypothesis without it. The base begins where the
+    The series is the last cause; `less` is the hypothesis without it. The base starts where the
     series has led it: modes may stand for what the base without them had bent itself to.
     """
     fit = series.fit
@@ -107,7 +107,7 @@ def _even(time: FloatArray) -> bool:
 
 
 def _moving(e: Experiment, most: int) -> slice:
-    """Return so many samples at most, from where the voltage begins to move."""
+    """Return so many samples at most, from where the voltage starts to move."""
     v = e.record.voltage[: e.stop]
     moves = np.flatnonzero(v != v[0])
     begin = max(0, int(moves[0]) - 1) if moves.size else 0
@@ -137,7 +137,7 @@ _MOST = 3
 
 @stage("causes judged again")
 def exchange(h: Hypothesis, known: SearchState) -> None:
-    """Fit in each cause's place what the screening beside all others finds near it."""
+    """Fit in each cause's place what the screening with all others finds near it."""
     for cause in h.causes:
         less = known.hypotheses.get(h.names - {cause.name})
         if less is None:
@@ -155,7 +155,7 @@ def exchange(h: Hypothesis, known: SearchState) -> None:
 
 
 def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Score]]:
-    """Return the starts of effects that promise nearly what `h` gains beside the causes of `less`.
+    """Return the starts of effects that promise nearly what `h` gains with the causes of `less`.
 
     They are not among the causes, and bend no curve that one of them bends.
     """
@@ -174,7 +174,7 @@ def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Scor
 def _put_in_place(
     h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: SearchState
 ) -> None:
-    """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
+    """Fit an effect with the causes of `less`, from there and from where `h` has led the base.
 
     To the end where that comes near.
     """
@@ -228,8 +228,8 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
     The cause that explains most alone, that of `h`, may stand for several and hold the search
-    there: sets without it are tried. Or it is one of them: pairs with what leads beside it are
-    tried, as a fit that adds one cause to the other may end in another minimum than one that begins
+    there: sets without it are tried. Or it is one of them: pairs with what leads with it are
+    tried, as a fit that adds one cause to the other may end in another minimum than one that starts
     with both. These go to their end, since they need more steps for it.
     """
     root, task, price = known.root, known.task, known.scale.limits.price
@@ -271,7 +271,7 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
 def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
     """Fit children of a hypothesis from their other parents, where those promise more.
 
-    Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
+    With fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
     a child gains what both of its parents have gained over what these share.
     """
     evidence = known.scale.evidence
@@ -291,7 +291,7 @@ def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
 def fit_rivals(known: SearchState) -> None:
     """Fit to their end the effects that may be in the place of each cause of the answer.
 
-    By their estimated evidence beside the other causes they are not clearly less likely.
+    By their estimated evidence with the other causes they are not clearly less likely.
     """
     best = known.answer
     for cause in best.causes:

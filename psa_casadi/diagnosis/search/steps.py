@@ -98,7 +98,7 @@ def steps_of(known: SearchState) -> list[Step]:
 
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
-    """Return the one step of a base fit that is not worth a search."""
+    """Return the one step of a base fit that is not searched."""
     view = examine(root_of(base, task), task)
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
