@@ -96,8 +96,8 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     for tone in _TONES:
         columns = [_response(forces, experiments, interval, tone, d) for d in _DECAYS]
         free = without(colour.whiten(np.hstack(columns)), basis)
-        for decay, item in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
-            decrease = _explained(item, residual) / colour.level**2
+        for decay, pair in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
+            decrease = _explained(pair, residual) / colour.level**2
             if best is None or decrease > best.decrease:
                 best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
     return best
@@ -113,10 +113,10 @@ def _explained(columns: FloatArray, residual: FloatArray) -> float:
     first: FloatArray | None = None
     for column in np.ascontiguousarray(columns.T):
         size = float(np.linalg.norm(column))
-        item = column if first is None else column - (first @ column) * first
-        norm = float(np.linalg.norm(item))
+        rest = column if first is None else column - (first @ column) * first
+        norm = float(np.linalg.norm(rest))
         if norm > _NEW * size:
-            first = item / norm
+            first = rest / norm
             value += float(first @ residual) ** 2
     return value
 
@@ -158,13 +158,13 @@ def _response(
     poles = [1.0, -2.0 * z.real, abs(z) ** 2]
     parts = []
     for force, e in zip(forces, experiments, strict=True):
-        item = np.zeros((int(e.used.sum()), 2))
+        part = np.zeros((int(e.used.sum()), 2))
         if force is not None:
             where = _places(e, interval)[e.used]
             rung = filtered([1.0, -1.0], poles, force)
-            item[:, 0] = rung[where]
-            item[:, 1] = np.append(0.0, rung)[where]  # a sample later
-        parts.append(item)
+            part[:, 0] = rung[where]
+            part[:, 1] = np.append(0.0, rung)[where]  # a sample later
+        parts.append(part)
     return np.vstack(parts)
 
 
@@ -206,9 +206,9 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     best = base
     for model in (ordinary, base.model):
         with suppress(PsaError):
-            item = search(model, experiments, linear=linear.candidates, progress=progress).best
-            best = min(best, item, key=lambda f: f.rms)
-            if item.cost < _AGAIN * len(item.residuals):
+            searched = search(model, experiments, linear=linear.candidates, progress=progress).best
+            best = min(best, searched, key=lambda f: f.rms)
+            if searched.cost < _AGAIN * len(searched.residuals):
                 break
     return best if _short(base, best) > _CLEAR else None
 
@@ -261,9 +261,9 @@ def instead_of(
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    item = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
-    if item is not None and _short(item, fit) < _LIKE:
-        return _tuned(item, experiments, progress)
+    rung = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
+    if rung is not None and _short(rung, fit) < _LIKE:
+        return _tuned(rung, experiments, progress)
     if not shows_ringing(experiments):
         return None
     again = retuned(base, experiments, progress, reached=fit.rms)
@@ -356,8 +356,8 @@ def _with_masses(
         )  # fmt: skip
 
     limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
-    items = [f for f in side_by_side(fit_from, starts) if f is not None and f.cost < limit]
-    ended = side_by_side(further, sorted(items, key=lambda f: f.cost)[:_BEST])
+    hopeful = [f for f in side_by_side(fit_from, starts) if f is not None and f.cost < limit]
+    ended = side_by_side(further, sorted(hopeful, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None

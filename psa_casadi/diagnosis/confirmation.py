@@ -101,14 +101,14 @@ def held_out_excess(
     make an error there too, so that only a clear excess counts. One below the detection limit of a
     stack does not.
     """
-    items = [not e.held_out_whole for e in experiments]
+    fitted = [not e.held_out_whole for e in experiments]
     parts = held_out_residuals(experiments, predicted)
     beyond = [
         rms(part) / floor.level
-        for part, floor, mine in zip(parts, noise, items, strict=True)
+        for part, floor, mine in zip(parts, noise, fitted, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    excess = held_out_within(colour, len(fit.theta), limits) if all(items) else Excess()
+    excess = held_out_within(colour, len(fit.theta), limits) if all(fitted) else Excess()
     worst = max(beyond, default=0.0)
     if worst > max(limits.unseen_ratio_of_records, excess.factor):
         excess = Excess(worst, limits.unseen_alarm)
@@ -151,10 +151,10 @@ def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
     if not fitted or few is not None:
         return () if few is None else (note("held_out_says_little", why=few),)
     notes = []
-    for code, requested, known in (
+    for code, judged_kinds, known in (
         ("extrapolates", held, fitted), ("not_held_out", fitted, held),
     ):  # fmt: skip
-        share, kinds = _without_like(requested, known)
+        share, kinds = _without_like(judged_kinds, known)
         if share > _SAMPLES:
             notes.append(note(code, share=share, kinds=kinds))
     used = np.concatenate([e.record.voltage[e.used] for e in experiments])

@@ -351,8 +351,8 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
-    items = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
-    return tuple(sorted(items, key=lambda c: -c.evidence))
+    every = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
+    return tuple(sorted(every, key=lambda c: -c.evidence))
 
 
 class _Following:
@@ -401,10 +401,10 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
     free = follow.orthogonal(used)
     weights, evidence = _weights(free, follow.target)
-    item = tuple(p @ (shape * weights) for p in parts)
+    added = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
-    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, item, strict=True))
+    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, added, strict=True))
     return Patch(
         port=kind.port,
         evidence=evidence,
@@ -412,7 +412,7 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
         predicted=predicted,
         kind=kind.name,
         weights=weights * shape,
-        added=item,
+        added=added,
         moved=moved,
     )
 
@@ -503,13 +503,13 @@ def with_patch(
             evaluations=POLISH,
         )
 
-    items = []
+    fits = []
     for theta in (before.theta + patch.moved, before.theta):
         with suppress(SimulationError):
-            items.append(fit_from(theta))
-    if not items:
+            fits.append(fit_from(theta))
+    if not fits:
         raise SimulationError("The model cannot be simulated with the unnamed correction.")
-    return min(items, key=lambda f: f.cost)
+    return min(fits, key=lambda f: f.cost)
 
 
 def _numbers(

@@ -140,10 +140,10 @@ def filtered(experiments: Sequence[Experiment]) -> float:
         past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
         lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]
         time = record.time[record.mask]
-        displayed, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
-        rest = displayed - columns @ np.linalg.lstsq(columns, displayed, rcond=None)[0]
+        reading, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
+        rest = reading - columns @ np.linalg.lstsq(columns, reading, rcond=None)[0]
         left += record.n * float(np.sum(rest**2)) / max(rest.size - taps - 3, 1)
-        total += record.n * float(np.sum(displayed**2)) / max(rest.size - 3, 1)
+        total += record.n * float(np.sum(reading**2)) / max(rest.size - 3, 1)
     return 1.0 - left / total if total > 0 else 0.0
 
 

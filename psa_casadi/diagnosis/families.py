@@ -90,13 +90,13 @@ def families(
     evidence = shown.evidence
     form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
-    item = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    kinds = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]
-    most = max([evidence, *(e for family, e in apart if family[1] in item)])
+    most = max([evidence, *(e for family, e in apart if family[1] in kinds)])
     others: dict[tuple[str, str], float] = {}
     for family, each in apart:
-        if "" not in item:
-            ahead = limits.enough * each - evidence if family[1] in item else each - most
+        if "" not in kinds:
+            ahead = limits.enough * each - evidence if family[1] in kinds else each - most
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     odds_of_all = bool(probability) + sum(others.values())
@@ -114,5 +114,5 @@ def families(
         )
         for family, effects in table.items()
     )
-    output = (f for f in rows if f.probability > _LEAST)
-    return tuple(sorted(output, key=lambda f: -f.probability))
+    probable = (f for f in rows if f.probability > _LEAST)
+    return tuple(sorted(probable, key=lambda f: -f.probability))

@@ -305,11 +305,11 @@ def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     basis = screening.independent(screening.whitened_jacobian(fit, colour)[:, kept])
     left, target = screening.without(white, basis), screening.without(target, basis)
     new = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
-    told = [trials[k] for k, q in zip(at, new, strict=True) if q]
+    significant = [trials[k] for k, q in zip(at, new, strict=True) if q]
     left, sizes = left[:, new], sizes[new]
     return [
-        [(*told[k], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
-        for rows, gains in _best_subsets(left, target, [t for t, _ in told], price)
+        [(*significant[k], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
+        for rows, gains in _best_subsets(left, target, [t for t, _ in significant], price)
     ]
 
 

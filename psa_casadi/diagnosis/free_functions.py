@@ -107,8 +107,8 @@ def formula_of(
     rows = zip(result.hypothesis.errors, free_function.held, strict=True)
     if any(error > _AS_WELL * before for error, before in rows):
         return None
-    told = _added(result, of, place, base, effects, scale)
-    model = told.model
+    function = _added(result, of, place, base, effects, scale)
+    model = function.model
     if len(whole) < len(of.experiments):
         with suppress(PsaError):
             fit = begun(result.hypothesis.fit, of.experiments, whole)
@@ -116,7 +116,7 @@ def formula_of(
                 model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
     equation = result.equation(port.balance, model.values)
     parameters = estimates(result.component, model)
-    return replace(told, model=model, equation=equation, parameters=parameters)
+    return replace(function, model=model, equation=equation, parameters=parameters)
 
 
 def _added(

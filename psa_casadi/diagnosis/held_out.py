@@ -113,9 +113,9 @@ def held_out_gain(
     unit.
     """
     gained = 0.0
-    for n, item, *rest in zip(samples, colour.each, straight, before, after, strict=True):
+    for n, c, *rest in zip(samples, colour.each, straight, before, after, strict=True):
         old, new = (max(float(np.hypot(e, rest[0])), 1e-300) for e in rest[1:])
-        gained += n / item.inflation * float(np.log(old / new))
+        gained += n / c.inflation * float(np.log(old / new))
     return gained
 
 
@@ -154,7 +154,7 @@ def held_out_parts(
     The parts are those of `psa_casadi.diagnosis.held_out`.
     """
     each = [held_out_residuals(experiments, p) for p in predicted]
-    sums, counts = parts_of(*([r[:, None] for r in item] for item in each))
+    sums, counts = parts_of(*([r[:, None] for r in residuals] for residuals in each))
     return sums[:, :, 0], counts[:, 0]
 
 
@@ -337,9 +337,9 @@ def removed_from(
     def errors(arrays: Sequence[FloatArray]) -> list[FloatArray]:
         """Return the errors (n, channels) where any channel is judged, else nan."""
         parts = []
-        for e, y, *item in zip(experiments, arrays, *judged, strict=True):
-            which, each = np.column_stack(item), y.reshape(len(y), -1).T
-            left = np.column_stack([e.errors(j, each[j]) for j in range(len(item))])
+        for e, y, *counted_rows in zip(experiments, arrays, *judged, strict=True):
+            which, each = np.column_stack(counted_rows), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(counted_rows))])
             parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
         return parts
 

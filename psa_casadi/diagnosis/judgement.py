@@ -211,15 +211,15 @@ class Judge:
             of = self.families[name]
             if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):
                 others = {(f.place, f.kind) for f in of if f.not_listed > 0.0}
-                items = [c for c in weighed.corrections if place_and_kind(c) in others]
-                better[name] = max(items, key=lambda c: c.evidence)
+                likely = [c for c in weighed.corrections if place_and_kind(c) in others]
+                better[name] = max(likely, key=lambda c: c.evidence)
         return better
 
     @property
     def unnamed(self) -> set[str]:
         """Causes that are vague, or without which the model is as likely."""
         price = self.limits.price
-        return {*self.unlisted, *(n for n, item in self.each.items() if item.evidence <= price)}
+        return {*self.unlisted, *(n for n, w in self.each.items() if w.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -336,7 +336,7 @@ class Judge:
     def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
         """Return a cause: its probability, the share of the error that it removes."""
         name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
-        item, of = shares.get(name), self.families.get(name, ())
+        share, of = shares.get(name), self.families.get(name, ())
         sure = sum(f.effects.get(name, 0.0) for f in of) if of else step.probability[name]
         return Cause(
             effect=name,
@@ -344,7 +344,7 @@ class Judge:
             confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
             cannot_be_told_from=indistinguishable(step, self.limits),
-            explained_share=0.0 if item is None else item.clipped[0],
+            explained_share=0.0 if share is None else share.clipped[0],
             remedy=step.cause.what_now.code,
             sizes=tuple(sizes),
             port=port,
@@ -494,19 +494,19 @@ class ModelJudge(Judge):
         Without causes these leave noise of any colour, and the innovations are compared.
         """
         rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.colours, strict=True)
-        for o, noise, item in rows:
+        for o, noise, colour in rows:
             if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
-                excess = held_out_within(item, len(step.fit.theta), self.limits)
+                excess = held_out_within(colour, len(step.fit.theta), self.limits)
                 if excess:
-                    output = note("held_out_unlike", output=o.column, ratio=excess.factor)
-                    return output, excess.p_value
+                    finding = note("held_out_unlike", output=o.column, ratio=excess.factor)
+                    return finding, excess.p_value
                 continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
             rms = missed_rms(self.experiments, step.view.of.predictions, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
             if held and rms > least:
-                output = note("held_out_unlike", output=o.column, ratio=rms / noise)
-                return output, step.test.p_value
+                finding = note("held_out_unlike", output=o.column, ratio=rms / noise)
+                return finding, step.test.p_value
         return None
 
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:

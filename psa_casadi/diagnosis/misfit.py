@@ -341,8 +341,8 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     if held is not None and held.significant:
         shares.append((held.share, _held(held, slope, count, unit)))
     lines = tuple((n.frequency, n.name, (n.amplitude, unit)) for n in spectrum.others[:3])
-    output = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
-    shares.append((spectrum.share, output))
+    tones = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
+    shares.append((spectrum.share, tones))
     gain = sorted((row for row in shares if row[0] > WORTH_SAYING), key=lambda row: -row[0])
     findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in gain)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:

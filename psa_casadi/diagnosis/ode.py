@@ -97,7 +97,7 @@ def diagnose_ode(
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
-    for base, runs, _, output in ways(
+    for base, runs, _, choices in ways(
         model,
         inputs,
         made,
@@ -109,7 +109,7 @@ def diagnose_ode(
         if base.interrupted:
             raise KeyboardInterrupt
         table = _table(base, runs, effects, leave_out, of_zeros)
-        way = _Way(base, runs, output, table, made, known_hold, progress, watch, [base])
+        way = _Way(base, runs, choices, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
         if _settled(judge):
@@ -130,14 +130,14 @@ def diagnose_ode(
 
 def _entering(of: Hypothesis) -> tuple[Note, ...]:
     """Return where noise enters a model, as far as it does not come from its sensors."""
-    rows = [(f.column, item) for f, item in zip(of.fit.channels, of.colours, strict=True)]
+    rows = [(f.column, c) for f, c in zip(of.fit.channels, of.colours, strict=True)]
     return tuple(
         note(
             "noise_enters", output=column, place=w.place, rate=w.rate, rms=(w.rms, w.unit),
-            time=w.time, nats=item.gained,
+            time=w.time, nats=c.gained,
         )
-        for column, item in rows
-        if (w := item.entering) is not None
+        for column, c in rows
+        if (w := c.entering) is not None
     )  # fmt: skip
 
 
@@ -245,8 +245,8 @@ def _settled(judge: ModelJudge) -> bool:
 
 def _coloured(judge: ModelJudge) -> bool:
     """Whether a base that lacks nothing leaves noise that is not white."""
-    item = judge.first.view.of.colours
-    return judge.verdict == "adequate" and any(c.autoregression.size for c in item)
+    colours = judge.first.view.of.colours
+    return judge.verdict == "adequate" and any(c.autoregression.size for c in colours)
 
 
 _Tasks = Callable[[tuple[Experiment, ...]], Task]

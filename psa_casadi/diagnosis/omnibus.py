@@ -82,12 +82,12 @@ def omnibus(
     }
     if not own:
         tests["size"] = _sizes(white, voltage, time, lengths)
-    observed, (p, share) = min(tests.items(), key=lambda item: item[1][0])
+    structure, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, observed, size, detection_limit, alarms_below)
+    return Omnibus(p, excess, structure, size, detection_limit, alarms_below)
 
 
 def whiteness(white: FloatArray) -> tuple[float, float]:

@@ -56,8 +56,8 @@ class Pack:
                 rows.append(replace(result, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
         worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
-        output = worst.p_value * len(rows)
-        return replace(worst, p_value=min(1.0, output if worst.alarm else p))
+        corrected = worst.p_value * len(rows)
+        return replace(worst, p_value=min(1.0, corrected if worst.alarm else p))
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
         """Return whether what a direction promises to remove exceeds the detection limit."""

@@ -418,8 +418,8 @@ def _changes(
         if not e.stop:
             return tangent.Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
         if others is not None:
-            item = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
-            return item if step else replace(item, y=item.y * sizes)
+            tangent_change = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
+            return tangent_change if step else replace(tangent_change, y=tangent_change.y * sizes)
         traced = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=way, by_start=False, outputs=outputs,
@@ -473,7 +473,7 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
         np.column_stack([d.column for d in directions]) @ gains,
         one_sided=False,
         finite=False,
-        further=tuple(np.column_stack(item) @ gains for item in every),
+        further=tuple(np.column_stack(columns) @ gains for columns in every),
     )
 
 

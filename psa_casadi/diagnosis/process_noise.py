@@ -101,10 +101,10 @@ def entering(
     prior, (at, _, _) = fit.unknowns.prior[: columns.shape[1]], windows(used)
     states = len(fit.model.state_names) - sum(len(c.states) for c in fit.model.effects)
     tried = _tried(parts[0], len(fit.model.input_names) + states)
-    few, observed = _first(parts, used)
+    few, few_used = _first(parts, used)
     if not tried.place.size or not few:
         return item
-    chosen = _found(few, observed, tried, prior).nats(np.flatnonzero(np.concatenate(observed)))
+    chosen = _found(few, few_used, tried, prior).nats(np.flatnonzero(np.concatenate(few_used)))
     tried = tried.neighbours(int(np.argmax(chosen)))
     result = _found(parts, used, tried, prior)
     best = int(np.argmax(result.nats(at)))
@@ -221,9 +221,9 @@ def _found(
     weight = np.where(known, 1.0 / np.where(known, prior, 1.0) ** 2, 0.0)
     moves = np.zeros((white.shape[1], len(prior)))
     for b in range(len(moves)):
-        item = columns[at, b]
-        normal = item.T @ item + np.mean(white[at, b] ** 2) * np.diag(weight)
-        moves[b] = np.linalg.lstsq(normal, item.T @ white[at, b], rcond=1e-12)[0]
+        part = columns[at, b]
+        normal = part.T @ part + np.mean(white[at, b] ** 2) * np.diag(weight)
+        moves[b] = np.linalg.lstsq(normal, part.T @ white[at, b], rcond=1e-12)[0]
         white[:, b] -= columns[:, b] @ moves[b]
     return _Found(white, spread, moves)
 
@@ -267,7 +267,7 @@ def _first(
     parts: Sequence[_Linear], used: Sequence[BoolArray]
 ) -> tuple[list[_Linear], list[BoolArray]]:
     """Return the first samples of records, as many as choose."""
-    left, few, observed = _CHOOSING, [], []
+    left, few, few_used = _CHOOSING, [], []
     for p, at in zip(parts, used, strict=True):
         n = min(len(at), left)
         if n < 2 or not at[:n].any():
@@ -276,9 +276,9 @@ def _first(
             p, phi=p.phi[: n - 1], before=p.before[: n - 1], after=p.after[: n - 1],
             c=p.c[:n], rows=p.rows[:n],
         ))  # fmt: skip
-        observed.append(at[:n])
+        few_used.append(at[:n])
         left -= n
-    return few, observed
+    return few, few_used
 
 
 def _tried(of: _Linear, count: int) -> _Noises:

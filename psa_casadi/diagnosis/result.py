@@ -227,16 +227,14 @@ class Diagnosis(Reported):
     families: tuple[Family, ...] = ()
     noise_kinds: tuple[NoiseFound, ...] = ()
 
-    def with_noise(self, noise: Sequence[NoiseFound], statement: Sequence[Note | str]) -> Self:
-        """Return it with the noise that its extended model leaves, and what is `statement` beside.
+    def with_noise(self, noise: Sequence[NoiseFound], remarks: Sequence[Note | str]) -> Self:
+        """Return it with the noise that its extended model leaves, and what is `remarks` beside.
 
         A reading that jumps a few times and stays there is no noise: nothing is `adequate` then.
         """
         notes = notes_of(noise)
         jumps = [t for t in notes if t.values["kind"] == "steps"]
-        result = replace(
-            self, remarks=(*self.remarks, *statement, *notes), noise_kinds=tuple(noise)
-        )
+        result = replace(self, remarks=(*self.remarks, *remarks, *notes), noise_kinds=tuple(noise))
         if not jumps or self.verdict != "adequate":
             return result
         left = Remaining(False, self.missed.p_value, jumps[0])

@@ -317,16 +317,16 @@ def _ways(
     table: dict[str, list[list[int]]] = {}
     weak, cost = np.full(len(trials), _NEW**2), np.zeros(len(trials))
     for places in spans(trials):
-        first, item = trials[places[0]], sizes[places]
+        first, of_span = trials[places[0]], sizes[places]
         if first.weight:
-            span = Span(gram[np.ix_(places, places)], item, limits.false_alarm)
-            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * item, _NEW) ** 2
+            span = Span(gram[np.ix_(places, places)], of_span, limits.false_alarm)
+            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * of_span, _NEW) ** 2
             cost[places[0]] = float(np.sum(span.penalties[:-1]))
-        if first.weight or item[0]:
+        if first.weight or of_span[0]:
             table.setdefault(first.effect.name, []).append(places)
-    most = {name: max(map(len, item)) for name, item in table.items()}
-    whole = {n: [p for p in item if len(p) == most[n]] for n, item in table.items()}
-    return {n: np.array(item, dtype=np.int64) for n, item in whole.items()}, weak, cost
+    most = {name: max(map(len, of_span)) for name, of_span in table.items()}
+    whole = {n: [p for p in of_span if len(p) == most[n]] for n, of_span in table.items()}
+    return {n: np.array(of_span, dtype=np.int64) for n, of_span in whole.items()}, weak, cost
 
 
 def _together(
@@ -416,7 +416,7 @@ def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> f
     `levels` are those of the noise in every channel.
     """
     rows = zip(colour.each, after.channels, levels, strict=True)
-    jacobian = np.concatenate([c.whiten(f.jacobian) / max(item, 1e-300) for c, f, item in rows])
+    jacobian = np.concatenate([c.whiten(f.jacobian) / max(level, 1e-300) for c, f, level in rows])
     known, other = before.unknowns, after.unknowns
     added = [k for k, n in enumerate(other.names) if n not in known.names]
     for record, states in enumerate(other.started):

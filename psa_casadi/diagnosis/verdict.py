@@ -136,7 +136,7 @@ def alternatives(
     Of several such effects the likeliest that can be fitted and simulated.
     """
     effects, experiments = {e.name: e for e in task.table}, task.experiments
-    items = []
+    models = []
     for step in named:
         for name in sorted(
             indistinguishable(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
@@ -151,11 +151,11 @@ def alternatives(
             except PsaError:
                 continue
             model = diagnosed_model(fitted.fit, experiments, fitted.predicted, stiffness_given)
-            items.append(
+            models.append(
                 Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
             )
             break
-    return tuple(items)
+    return tuple(models)
 
 
 def _fitted(step: Step, name: str) -> Hypothesis | None:
@@ -195,7 +195,7 @@ def diagnosed_model(
 ) -> Model:
     """Return a model of a diagnosis with its evidence; `spent` is its error's budget."""
     result = determinacy(fit, experiments)
-    output = replace(
+    evidence = replace(
         evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
         budget=None
@@ -210,7 +210,7 @@ def diagnosed_model(
         ),
     )
     records = [e.record for e in experiments]
-    return with_provenance(fit.model, result, records, stiffness_given, evidence=output)
+    return with_provenance(fit.model, result, records, stiffness_given, evidence=evidence)
 
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:

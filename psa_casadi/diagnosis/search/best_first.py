@@ -339,9 +339,9 @@ class _Search:
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
         fit = base_fit.from_band(h.fit, experiments, task.progress)
-        item = hypothesis(h.causes, fit, experiments, final=True)
-        if item is not None and (h.causes or not examine(item, task, self.known.trials).leaves):
-            self.known.note(item)
+        other = hypothesis(h.causes, fit, experiments, final=True)
+        if other is not None and (h.causes or not examine(other, task, self.known.trials).leaves):
+            self.known.note(other)
         return self.known.hypotheses.get(h.names) is not h
 
     def seen_in_records(self) -> bool:

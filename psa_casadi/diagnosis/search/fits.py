@@ -179,8 +179,8 @@ def with_causes(before: Hypothesis, start: Together, goal: float = np.inf) -> Hy
         for d, gain in zip(start.directions, start.gains, strict=True)
     ]
     memory = tuple(
-        {k: v for d in start.directions for k, v in d.memory[r].items()} | item
-        for r, item in enumerate(before.fit.starts())
+        {k: v for d in start.directions for k, v in d.memory[r].items()} | state
+        for r, state in enumerate(before.fit.starts())
     )
     quick = fit_with_all(before.fit, before.experiments, added, memory, {}, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
@@ -240,20 +240,20 @@ def in_place(
     whole: Hypothesis,
     less: Hypothesis,
     reached: Fit,
-    item: Fit,
+    alone: Fit,
     effect: Component,
     goal: float = np.inf,
 ) -> Hypothesis | None:
     """Fit an effect with the causes of `less`, where the `whole` has another one.
 
-    The effect begins with its values in its `item` fit, the rest with those that were `reached`;
+    The effect begins with its values in its `alone` fit, the rest with those that were `reached`;
     what `reached` does not have stays as in `less`.
     """
-    values = item.model.values
+    values = alone.model.values
     start = (
         {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
         values[effect.gain or ""],
-        tuple({**s, **r} for s, r in zip(item.starts(), reached.starts(), strict=True)),
+        tuple({**s, **r} for s, r in zip(alone.starts(), reached.starts(), strict=True)),
     )
     return exchanged(whole, less, effect, start, reached, goal)
 

@@ -147,23 +147,23 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        displayed = tuple(fit.shown(experiments))
+        predictions = tuple(fit.shown(experiments))
     except PsaError:
         return None
     rows, colours = [], []
     for k, f in enumerate(fit.channels):
         held, train, every, rests = [], [], [], []
-        for e, y in zip(experiments, displayed, strict=True):
+        for e, y in zip(experiments, predictions, strict=True):
             left = e.errors(f.number, y[:, k])
             held.append(left[e.at(f.number, e.held_out)])
             train.append(left[e.at(f.number)])
             every.append(left[np.isfinite(left)])
             rests.append(left)
-        item = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
-        rows.append((item[0] or (f.rms if k else 0.0), *item[1:]))
+        errors = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
+        rows.append((errors[0] or (f.rms if k else 0.0), *errors[1:]))
         fitted = [e.at(f.number) for e in experiments]
         judged = [e.at(f.number, e.held_out) for e in experiments]
-        rates = [np.gradient(y[:, k]) for y in displayed]
+        rates = [np.gradient(y[:, k]) for y in predictions]
         # the parameters of several channels do not follow the colour of one of them
         free = slice(0 if fit.further else None)
         follow = f.jacobian[:, free], fit.unknowns.prior[free]
@@ -173,7 +173,7 @@ def hypothesis(
         tuple(causes),
         fit,
         experiments,
-        displayed,
+        predictions,
         held_rms,
         train_rms,
         whole,
@@ -382,8 +382,8 @@ def _asked(
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
     share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
     size = float(np.sqrt(min(share, 1.0))) * fit.rms
-    requested = replace(test, p_value=p, structure="effect", size=size)
-    return requested if requested.alarm else test
+    of_effect = replace(test, p_value=p, structure="effect", size=size)
+    return of_effect if of_effect.alarm else test
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
@@ -410,14 +410,14 @@ def held_out_confirms(of: Hypothesis, before: Hypothesis, scale: Scale) -> bool:
     if not any(scale.held):
         return True
     promise = 0.0
-    for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
+    for k, (f, c) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
         rows = zip(of.experiments, of.predictions, before.predictions, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )
         if change.size:
             after = max(float(np.hypot(of.held[k], f.straight)), 1e-300)
-            samples = change.size / item.inflation
+            samples = change.size / c.inflation
             promise += 0.5 * samples * float(np.mean(change**2)) / after**2
     gained, score = scale.held_out(of, before), scale.of_fitted(of) - scale.of_fitted(before)
     return confirmed(gained, promise, score, scale.limits)

@@ -202,13 +202,13 @@ def _copies(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[Copy]:
     table = [e for e in known.task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
     power, result = copies(less.fit, added, trials, known.scale.colour, known.task.limits)
-    item = known.scale.evidence(h)
+    evidence = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in result.items():
         left = 0.5 * power * (1.0 - copy.share)
         fitted = known.hypotheses.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
-        if left < NEAR and reached < item - left - NEAR:
+        if left < NEAR and reached < evidence - left - NEAR:
             lost[name] = left
     return [result[n] for n in sorted(lost, key=lambda n: lost[n])[:_MOST]]
 
@@ -244,8 +244,8 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
         )
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
-    items = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
-    pairs = [s for s in ranked if s.names in items]
+    with_best = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
+    pairs = [s for s in ranked if s.names in with_best]
     apart = [s for s in ranked if not s.names & h.names]
     starts = [s for s in [*pairs, *apart] if s.names not in known.hypotheses][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
@@ -257,7 +257,7 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
     jobs = [(way, s) for way in ways for s in starts]
     results = side_by_side(lambda j: j[0](root, j[1], goal), jobs)
     fitted = [f for f in results if f is not None]
-    better = [f for f in fitted if f.names in items and known.scale.evidence(f) > 0.0]
+    better = [f for f in fitted if f.names in with_best and known.scale.evidence(f) > 0.0]
     tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
@@ -301,8 +301,8 @@ def fit_rivals(known: SearchState) -> None:
         less = known.hypotheses.get(names)
         if less is None:
             continue
-        view, item = known.view(less), known.scale.evidence(less)
-        top = known.scale.evidence(best) - item
+        view, base_evidence = known.view(less), known.scale.evidence(less)
+        top = known.scale.evidence(best) - base_evidence
         near = top - known.task.limits.clearly * temperature(top)
         for name, evidence in view.estimated().items():
             if evidence > near and names | {name} not in known.hypotheses:
@@ -311,5 +311,5 @@ def fit_rivals(known: SearchState) -> None:
         children = [h for h in larger if len(h.names - names) == 1]
         known.remember(less, *(n for h in children for n in h.names - names))
         open_ones = [h for h in children if not h.final]
-        known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
+        known.finish([h for h in open_ones if known.scale.evidence(h) - base_evidence > near])
     known.admissible = frozenset(n for n, h in known.hypotheses.items() if known.is_admissible(h))
