@@ -2,7 +2,7 @@
 
 After each step of the force a resonance rings, and what the samples show of it is a tone below half
 the sampling rate f_s that decays as fast as the resonance itself, whatever its own frequency: one
-at f is seen at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
+at f appears at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
 
     q_k = 2 Re(z) q_(k-1) - |z|^2 q_(k-2) + b_0 (F_k - F_(k-1)) + b_1 (F_(k-1) - F_(k-2)),
     z = exp((-2 pi d + 2 pi i f) / f_s)
@@ -61,12 +61,12 @@ class Ringing:
 
     @property
     def resonances(self) -> tuple[tuple[float, float], ...]:
-        """Frequencies [Hz] with damping ratios that are seen at this tone when sampled."""
+        """Frequencies [Hz] with damping ratios that appear at this tone when sampled."""
         return tuple((f, min(1.0, self.decay / f)) for f in images(self.tone, self.rate, _IMAGES))
 
 
 def images(tone: float, rate: float, most: int) -> list[float]:
-    """Return what is seen at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
+    """Return what appears at a tone f, |k f_s + f| and |k f_s - f| for k up to `most` [Hz].
 
     At half the sampling rate these are pairs, apart by rounding only.
     """
@@ -95,8 +95,8 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     for tone in _TONES:
         columns = [_response(forces, experiments, interval, tone, d) for d in _DECAYS]
         free = without(colour.whiten(np.hstack(columns)), basis)
-        for decay, item in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
-            decrease = _explained(item, residual) / colour.level**2
+        for decay, pair in zip(_DECAYS, np.hsplit(free, len(_DECAYS)), strict=True):
+            decrease = _explained(pair, residual) / colour.level**2
             if best is None or decrease > best.decrease:
                 best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
     return best
@@ -112,10 +112,10 @@ def _explained(columns: FloatArray, residual: FloatArray) -> float:
     first: FloatArray | None = None
     for column in np.ascontiguousarray(columns.T):
         size = float(np.linalg.norm(column))
-        item = column if first is None else column - (first @ column) * first
-        norm = float(np.linalg.norm(item))
+        rest = column if first is None else column - (first @ column) * first
+        norm = float(np.linalg.norm(rest))
         if norm > _NEW * size:
-            first = item / norm
+            first = rest / norm
             value += float(first @ residual) ** 2
     return value
 
@@ -157,20 +157,20 @@ def _response(
     poles = [1.0, -2.0 * z.real, abs(z) ** 2]
     parts = []
     for force, e in zip(forces, experiments, strict=True):
-        item = np.zeros((int(e.used.sum()), 2))
+        part = np.zeros((int(e.used.sum()), 2))
         if force is not None:
             where = _places(e, interval)[e.used]
             rung = filtered([1.0, -1.0], poles, force)
-            item[:, 0] = rung[where]
-            item[:, 1] = np.append(0.0, rung)[where]  # a sample later
-        parts.append(item)
+            part[:, 0] = rung[where]
+            part[:, 1] = np.append(0.0, rung)[where]  # a sample later
+        parts.append(part)
     return np.vstack(parts)
 
 
 #: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
 #: of another effect.
 _AS_GOOD, _LIKE = 10.0, 3.0
-#: To what share of the rms one beside the causes found must lead.
+#: To what share of the rms one added to the causes must lead.
 _MUCH = 0.985
 #: n ln(ratio of rms) by which a fit with resonances must be better to count.
 _CLEAR = 15.0
@@ -179,10 +179,10 @@ _NEAR_IMAGES = 3
 _QUICK, _FIRST, _BEST = 8, 4, 2
 #: How far above what is of use the cost after the first evaluations may be.
 _HOPEFUL = 2.0
-#: A search for resonances begins again from elsewhere where its mean weighted square exceeds this.
+#: A search for resonances restarts from elsewhere where its mean weighted square exceeds this.
 _AGAIN = 1.5
 #: Sampling rate [Hz] from which a stack's resonances may show though they lie above the band; the
-#: decrease of the whitened sum of squares from which ringing is seen, and resonances at most.
+#: decrease of the whitened sum of squares from which ringing is detected, and resonances at most.
 _SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 
 
@@ -190,7 +190,7 @@ _SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
     """Fit the base from resonances and lags that fast records show; None if none explain more.
 
-    Ordinary lags lead nowhere for a stack that rings within the record's band. The search begins
+    Ordinary lags lead nowhere for a stack that rings within the record's band. The search starts
     with an ordinary loop and, while it misses something, with that of the base.
     """
     if "k_P" not in base.model.values:
@@ -205,9 +205,9 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     best = base
     for model in (ordinary, base.model):
         with suppress(PsaError):
-            item = search(model, experiments, linear=linear, progress=progress).best
-            best = min(best, item, key=lambda f: f.rms)
-            if item.cost < _AGAIN * len(item.residuals):
+            searched = search(model, experiments, linear=linear, progress=progress).best
+            best = min(best, searched, key=lambda f: f.rms)
+            if searched.cost < _AGAIN * len(searched.residuals):
                 break
     return best if _short(base, best) > _CLEAR else None
 
@@ -260,9 +260,9 @@ def instead_of(
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    item = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
-    if item is not None and _short(item, fit) < _LIKE:
-        return _tuned(item, experiments, progress)
+    rung = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
+    if rung is not None and _short(rung, fit) < _LIKE:
+        return _tuned(rung, experiments, progress)
     if not shows_ringing(experiments):
         return None
     again = retuned(base, experiments, progress, reached=fit.rms)
@@ -277,7 +277,7 @@ def rings(effect: Component) -> bool:
 
 
 def _tuned(fit: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
-    """Return the fit with its mechanics sought again while it rings; k_P is free where told."""
+    """Return the fit with its mechanics sought again while it rings; k_P is free if determined."""
     left = ringing(fit, experiments)
     if left is None or left.decrease >= SEEN:
         fit = retuned(fit, experiments, progress)
@@ -355,8 +355,8 @@ def _with_masses(
         )  # fmt: skip
 
     limit = _HOPEFUL * before.cost * (least / before.rms) ** 2
-    items = [f for f in side_by_side(fit_from, starts) if f is not None and f.cost < limit]
-    ended = side_by_side(further, sorted(items, key=lambda f: f.cost)[:_BEST])
+    hopeful = [f for f in side_by_side(fit_from, starts) if f is not None and f.cost < limit]
+    ended = side_by_side(further, sorted(hopeful, key=lambda f: f.cost)[:_BEST])
     best = min((f for f in ended if f is not None), key=lambda f: f.cost, default=None)
     if best is None:
         return None

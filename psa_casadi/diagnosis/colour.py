@@ -16,8 +16,8 @@ from psa_casadi.units import FloatArray
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05
 _LARGEST = 0.95
-#: Correlations at which it is asked what a projection leaves, the least share of a difference that
-#: must be left, and the share of directions up to which it is asked at all.
+#: Correlations at which a projection is evaluated, the least share of a difference that
+#: must be left, and the share of directions up to which it is evaluated at all.
 _TRIED, _TOLD, _MANY = (0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.88, _LARGEST), 0.5, 0.25
 
 
@@ -26,7 +26,7 @@ class Colour:
     """Noise e_k = a_1 e_(k-1) + ... + w_k, with w white of standard deviation `level` [m].
 
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
-    records' numbers of samples. `further` are the colours of the columns beside the displacement,
+    records' numbers of samples. `further` are the colours of the columns besides the displacement,
     each with a level in its own unit. The first samples of a record count over the noise's rms, or
     with 0 where a record has no `known_start`; every sample over its `spread` (samples,),
     where the noise is not as large everywhere.
@@ -76,9 +76,9 @@ class Colour:
         for a, power, length in records:
             part = signal[first : first + length]
             if a.size and length > a.size:
-                item = white[first : first + length]
-                item[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
-                item[: a.size] = self.known_start * part[: a.size] / np.sqrt(power)
+                filtered_part = white[first : first + length]
+                filtered_part[:] = filtered(np.concatenate([[1.0], -a]), [1.0], part)
+                filtered_part[: a.size] = self.known_start * part[: a.size] / np.sqrt(power)
             first += length
         if self.spread is not None:
             white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))
@@ -106,27 +106,29 @@ def colour_of(
 
     `removed` (samples, k) is an orthonormal basis of what was projected out of it: slow directions
     for the most part, which take a colour's slow part along. The correlation is the one that leaves
-    what is seen (`left_correlation`), where that can be told.
+    the observed one (`left_correlation`), where that can be estimated.
 
     `known` holds the autoregression of records whose noise is known without a model (repeats). The
     others share one of first order, estimated from the remainder: it can describe the noise of a
     sensor with a filter, but neither a tone nor a slow misfit on top of white noise, so that those
     remain visible after whitening.
     """
-    items = list(known or [None] * len(lengths))
+    regressions = list(known or [None] * len(lengths))
     top = bottom = 0.0
     ends = np.cumsum(lengths)[:-1]
-    for part, item in zip(np.split(remainder, ends), items, strict=True):
-        if item is None:
+    for part, regression in zip(np.split(remainder, ends), regressions, strict=True):
+        if regression is None:
             top += float(part[1:] @ part[:-1])
             bottom += float(part @ part)
-    observed = top / bottom if bottom > 0 else 0.0
+    correlation_left = top / bottom if bottom > 0 else 0.0
     if removed is not None and bottom > 0:
-        pairs = zip(np.split(removed, ends), items, strict=True)
-        observed = _before(observed, [q for q, item in pairs if item is None and len(q)])
-    correlation = float(np.clip(observed, 0.0, _LARGEST))
+        pairs = zip(np.split(removed, ends), regressions, strict=True)
+        correlation_left = _before(
+            correlation_left, [q for q, regression in pairs if regression is None and len(q)]
+        )
+    correlation = float(np.clip(correlation_left, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
-    each = tuple(shared if item is None else item for item in items)
+    each = tuple(shared if regression is None else regression for regression in regressions)
     return _with_level(each, remainder, lengths)
 
 
@@ -172,17 +174,17 @@ def _before(value: float, removed: Sequence[FloatArray]) -> float:
     samples, directions = sum(len(part) for part in removed), removed[0].shape[1]
     if directions > _MANY * samples:
         return value
-    item, left = [0.0], [left_correlation(0.0, removed)]
+    tried, left = [0.0], [left_correlation(0.0, removed)]
     for r in _TRIED:
         if value <= left[-1]:
             break
         more = left_correlation(r, removed)
-        if more - left[-1] < _TOLD * (r - item[-1]):
+        if more - left[-1] < _TOLD * (r - tried[-1]):
             break
-        item.append(r)
+        tried.append(r)
         left.append(more)
     beyond = min(0.0, value - left[0]), max(0.0, value - left[-1])
-    return float(np.interp(value, left, item)) + beyond[0] + beyond[1]
+    return float(np.interp(value, left, tried)) + beyond[0] + beyond[1]
 
 
 def noise_rms(residual: FloatArray, colour: Colour) -> float:
@@ -197,7 +199,7 @@ def noise_rms(residual: FloatArray, colour: Colour) -> float:
 def noise_left(fit: Fit, colour: Colour) -> list[float]:
     """Return the noise in every output's residual, over the shares that weighted it."""
     rows = zip(fit.channels, colour.each, strict=True)
-    return [noise_rms(o.residuals, item) for o, item in rows]
+    return [noise_rms(o.residuals, c) for o, c in rows]
 
 
 def noise_told(
@@ -207,13 +209,15 @@ def noise_told(
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
-    output, levels = with_noise(fit, experiments), []
-    for o, item in zip(fit.channels, colour.each, strict=True):
+    weighted, levels = with_noise(fit, experiments), []
+    for o, c in zip(fit.channels, colour.each, strict=True):
         j = o.number
         rows = zip(o.records, o.parts, strict=True)
-        left = np.concatenate([p * (experiments[k].share(j) / output[k].share(j)) for k, p in rows])
-        levels.append(noise_rms(left, item) * noise_share(output, j))
-    return output, tuple(levels)
+        left = np.concatenate(
+            [p * (experiments[k].share(j) / weighted[k].share(j)) for k, p in rows]
+        )
+        levels.append(noise_rms(left, c) * noise_share(weighted, j))
+    return weighted, tuple(levels)
 
 
 def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:

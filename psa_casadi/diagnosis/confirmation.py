@@ -45,7 +45,7 @@ def unconfirmed(
     """Return why the records do not confirm the causes of an extended model; None where they do.
 
     `hidden` is the share of the readings that a saturated sensor has made. The interval of the
-    held-out `gain` tells nothing where it reaches from an error that doubles to the `whole` gain
+    held-out `gain` is uninformative where it reaches from an error that doubles to the `whole` gain
     [%], which leaves the noise alone; that of a saturation which shows in one of eight parts does
     too, so that all but the part that gains most must also have `lost` something [nats]. The
     voltage must be one that stacks bear and, where the causes explain the records `partly` and
@@ -68,7 +68,7 @@ def unconfirmed(
 
 
 #: Largest held-out errors that do not count (stray readings), the fewest that are tested, and those
-#: of a whole record: fewer do not tell the colour of its noise.
+#: of a whole record: fewer do not determine the colour of its noise.
 _STRAY, _FEWEST, _FEWEST_OF_RECORDS = 2, 50, 512
 
 
@@ -98,17 +98,17 @@ def held_out_excess(
     about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
     samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
     are held out are compared with their own `noise`: parameters that the fitted ones leave open
-    make an error there too, so that only a clear excess counts. One below what can be told of a
+    make an error there too, so that only a clear excess counts. One below the detection limit of a
     stack does not.
     """
-    items = [not e.held_out_whole for e in experiments]
+    fitted = [not e.held_out_whole for e in experiments]
     parts = held_out_residuals(experiments, predicted)
     beyond = [
         rms(part) / floor.level
-        for part, floor, mine in zip(parts, noise, items, strict=True)
+        for part, floor, mine in zip(parts, noise, fitted, strict=True)
         if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
     ]
-    excess = held_out_within(colour, len(fit.theta), limits) if all(items) else Excess()
+    excess = held_out_within(colour, len(fit.theta), limits) if all(fitted) else Excess()
     worst = max(beyond, default=0.0)
     if worst > max(limits.unseen_ratio_of_records, excess.factor):
         excess = Excess(worst, limits.unseen_alarm)
@@ -131,15 +131,15 @@ def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
     return Excess(float(np.sqrt(ratio)), chance) if reports else Excess()
 
 
-#: Shares of the samples, and of the voltage's span, that are worth a word.
+#: Shares of the samples, and of the voltage's span, that are mentioned.
 _SAMPLES, _SPAN = 0.02, 0.01
 
 
 def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
-    """Return what the held-out figure does not rest on; none where all is shown.
+    """Return what the held-out figure does not rest on; none where all is covered.
 
     There may be too few of them. It extrapolates where held-out samples have kinds of stretch that
-    no fitted sample shows, and where their voltage goes beyond the fitted one. It says nothing of
+    no fitted sample shows, and where their voltage goes beyond the fitted one. It ignores
     kinds that are not held out.
     """
     records = [e.record for e in experiments]
@@ -151,10 +151,10 @@ def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
     if not fitted or few is not None:
         return () if few is None else (note("held_out_says_little", why=few),)
     notes = []
-    for code, requested, known in (
+    for code, judged_kinds, known in (
         ("extrapolates", held, fitted), ("not_held_out", fitted, held),
     ):  # fmt: skip
-        share, kinds = _without_like(requested, known)
+        share, kinds = _without_like(judged_kinds, known)
         if share > _SAMPLES:
             notes.append(note(code, share=share, kinds=kinds))
     used = np.concatenate([e.record.voltage[e.used] for e in experiments])

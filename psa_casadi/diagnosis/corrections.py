@@ -1,10 +1,10 @@
-"""Unnamed corrections beside a model: their forms, and what each would remove.
+"""Unnamed corrections of a model: their forms, and what each would remove.
 
-Beside the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
+About the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
 of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
 of the largest evidence. The evidence is on the scale of the hypotheses' score.
 
-A correction is a sum of columns with weights w_k ~ N(0, (s p_k)^2): s its size, found from the
+A correction is a sum of columns with weights w_k ~ N(0, (s p_k)^2): s its size, estimated from the
 data, p_k the shape of the prior, smooth where 1/k or steeper. Quantities are over their range:
 
     curve         cos(k pi q)                       p_k = 1/k            of voltage or displacement
@@ -209,10 +209,10 @@ def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Correction:
-    """An unnamed correction beside a model, at a `port`: evidence over it, and what it leaves.
+    """An unnamed correction of a model, at a `port`: evidence over it, and what it leaves.
 
     `predicted` are whole records with the correction, (n,) of one channel or (n, channels), and
-    `held` the errors of these channels in held-out samples. Of one that is told, `open_to` are
+    `held` the errors of these channels in held-out samples. Of a reported one, `open_to` are
     others that explain the data as well, and `share` is what it removes of the base's held-out
     error above the noise.
     """
@@ -279,9 +279,9 @@ class FreeFunction(Correction):
     """One of any model: a function without memory `of` some variables, added to a port's sum.
 
     Along all records it adds `added` (n,) in the port's `unit`; that follows the `variable`, of
-    these the one that tells most of it, with the values `along` (n,). `model` holds it. Where few
-    terms of a library predict as well as a polynomial, it is their sum: `equation`, with
-    `parameters` in SI units. `fitted` is the `Formula` that it was told of.
+    these the one that explains most of it, with the values `along` (n,). `model` holds it. Where
+    few terms of a library predict as well as a polynomial, it is their sum: `equation`, with
+    `parameters` in SI units. `fitted` is the `Formula` that it is made of.
     """
 
     of: str
@@ -319,7 +319,7 @@ def best_of(
     colour: Colour,
     limits: Thresholds = LIMITS,
 ) -> Correction | None:
-    """Return the best correction beside a model; None if none helps.
+    """Return the best correction of a model; None if none helps.
 
     Its evidence must be above the price of a cause, and the log-likelihood of the held-out samples,
     where the model's channels err by `held`, must gain as much as for a cause.
@@ -343,7 +343,7 @@ def best_of(
 
 
 def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> tuple[Patch, ...]:
-    """Return all corrections beside a fit, the one of the highest evidence first."""
+    """Return all corrections of a fit, the one of the highest evidence first."""
     try:
         full = fit.predictions(experiments)
         signals = Signals(experiments, [p.displacement for p in full], responses(fit, experiments))
@@ -351,8 +351,8 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
         return ()
     follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
-    items = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
-    return tuple(sorted(items, key=lambda c: -c.evidence))
+    every = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
+    return tuple(sorted(every, key=lambda c: -c.evidence))
 
 
 class _Following:
@@ -401,10 +401,10 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
     used = np.vstack([p[e.used] for p, e in zip(parts, experiments, strict=True)]) * shape
     free = follow.orthogonal(used)
     weights, evidence = _weights(free, follow.target)
-    item = tuple(p @ (shape * weights) for p in parts)
+    added = tuple(p @ (shape * weights) for p in parts)
     moved = follow.moved(used @ weights)
     changes = [j @ moved for j in follow.whole]
-    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, item, strict=True))
+    predicted = tuple(y + c + o for y, c, o in zip(signals.predicted, changes, added, strict=True))
     return Patch(
         port=kind.port,
         evidence=evidence,
@@ -412,7 +412,7 @@ def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
         predicted=predicted,
         kind=kind.name,
         weights=weights * shape,
-        added=item,
+        added=added,
         moved=moved,
     )
 
@@ -475,7 +475,7 @@ def responses(
 def with_patch(
     before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> Fit:
-    """Return a fit with the correction beside the model, begun with the weights that it has.
+    """Return a fit with the correction added to the model, begun with the weights that it has.
 
     The model's own values begin where they follow the correction, and where they were.
 
@@ -503,13 +503,13 @@ def with_patch(
             evaluations=POLISH,
         )
 
-    items = []
+    fits = []
     for theta in (before.theta + patch.moved, before.theta):
         with suppress(SimulationError):
-            items.append(fit_from(theta))
-    if not items:
+            fits.append(fit_from(theta))
+    if not fits:
         raise SimulationError("The model cannot be simulated with the unnamed correction.")
-    return min(items, key=lambda f: f.cost)
+    return min(fits, key=lambda f: f.cost)
 
 
 def _numbers(

@@ -52,7 +52,7 @@ from psa_casadi.simulation.side_by_side import compiled_ahead, one_thread_of_alg
 from psa_casadi.simulation.timings import stage
 from psa_casadi.units import FloatArray
 
-#: A voltage with less of its variance about a parabola over time is not told from a drift.
+#: A voltage with less of its variance about a parabola over time is not separated from a drift.
 _TREND = 0.05
 #: Samples that a linear filter of the voltage looks back, and that it needs for each of them.
 _TAPS, _EACH = 128, 8
@@ -130,7 +130,7 @@ def _about_trend(time: FloatArray, signal: FloatArray) -> FloatArray:
 def filtered(experiments: Sequence[Experiment]) -> float:
     """Share of the displacements' variance that linear filters of the voltage explain.
 
-    A finite impulse response for each record beside a parabola over time; variances per degree of
+    A finite impulse response for each record with a parabola over time; variances per degree of
     freedom, so that a filter of what has nothing to do with the voltage explains nothing.
     """
     left = total = 0.0
@@ -140,14 +140,14 @@ def filtered(experiments: Sequence[Experiment]) -> float:
         past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
         lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]
         time = record.time[record.mask]
-        displayed, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
-        rest = displayed - columns @ np.linalg.lstsq(columns, displayed, rcond=None)[0]
+        reading, columns = _about_trend(time, y[record.mask]), _about_trend(time, lagged)
+        rest = reading - columns @ np.linalg.lstsq(columns, reading, rcond=None)[0]
         left += record.n * float(np.sum(rest**2)) / max(rest.size - taps - 3, 1)
-        total += record.n * float(np.sum(displayed**2)) / max(rest.size - 3, 1)
+        total += record.n * float(np.sum(reading**2)) / max(rest.size - 3, 1)
     return 1.0 - left / total if total > 0 else 0.0
 
 
-#: The places that effects belong to, in the order in which they are told.
+#: The places that effects belong to, in the order in which they are listed.
 _PLACES = ("drive", "sensor", "plant", "environment")
 #: Probability below which an effect is no rival.
 _RIVAL = 0.01
@@ -246,7 +246,7 @@ def decided(
     )  # fmt: skip
 
 
-#: So many further stuck readings are worth a second search.
+#: So many further stuck readings justify a second search.
 MORE = 3
 
 
@@ -305,7 +305,7 @@ def diagnose(
         )
     try:
         laws = laws_of(start, [e.record for e in task.experiments if e.stop], task.table)
-        # from the end: the screening begins at the front
+        # from the end: the screening starts at the front
         with compiled_ahead(reversed(screened_with(start, task.table, laws))):
             result = _against(since, start, task, scale_given)
         noise: tuple[NoiseFound, ...] = ()

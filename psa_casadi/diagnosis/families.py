@@ -21,7 +21,7 @@ _DOES: dict[str, Kind] = {
 _PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
 #: The largest probability that is stated.
 SUREST = 0.99
-#: Families less probable than this are not told.
+#: Families less probable than this are not reported.
 _LEAST = 0.01
 
 
@@ -49,7 +49,7 @@ def place_and_kind(c: Correction) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class CauseEvidence:
-    """What a cause has: its evidence E [nats], from n samples, beside which k causes with it."""
+    """What a cause has: its evidence E [nats], from n samples, with k causes in all."""
 
     evidence: float
     samples: int
@@ -59,7 +59,7 @@ class CauseEvidence:
         """Return the probability that it is of any kind that was tried.
 
         The odds of what looks like it, but nobody has thought of or is the form of another cause,
-        are `unknown` k (n/E)^(1/2). The smaller it is beside the noise, the less of its form shows.
+        are `unknown` k (n/E)^(1/2). The smaller it is over the noise, the less of its form shows.
         """
         small = float(np.sqrt(self.samples / max(self.evidence, 1e-300)))
         return 1.0 / (1.0 + limits.unknown * self.causes * small)
@@ -75,9 +75,9 @@ def families(
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; what is `shown` of the cause is over the model without it, beside which the
-    `corrections` stand. With the evidence F_k, above the price of a cause, of each correction and
-    that E of the cause, the odds that it is not listed are
+    families; what is `shown` of the cause is over the model without it, with the `corrections` of
+    that model. With the evidence F_k, above the price of a cause, of each correction and that E of
+    the cause, the odds that it is not listed are
 
         sum_k exp((F_k - E*) / T),   T = max(temperature 2, further E)
 
@@ -90,13 +90,13 @@ def families(
     evidence = shown.evidence
     form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
-    item = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    kinds = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
     apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]
-    most = max([evidence, *(e for family, e in apart if family[1] in item)])
+    most = max([evidence, *(e for family, e in apart if family[1] in kinds)])
     others: dict[tuple[str, str], float] = {}
     for family, each in apart:
-        if "" not in item:
-            ahead = limits.enough * each - evidence if family[1] in item else each - most
+        if "" not in kinds:
+            ahead = limits.enough * each - evidence if family[1] in kinds else each - most
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     odds_of_all = bool(probability) + sum(others.values())
@@ -114,5 +114,5 @@ def families(
         )
         for family, effects in table.items()
     )
-    output = (f for f in rows if f.probability > _LEAST)
-    return tuple(sorted(output, key=lambda f: -f.probability))
+    probable = (f for f in rows if f.probability > _LEAST)
+    return tuple(sorted(probable, key=lambda f: -f.probability))

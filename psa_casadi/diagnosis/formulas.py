@@ -4,9 +4,9 @@
 
 The terms m_k are products of up to three of what the port sees, q |q|, sines and cosines of angles,
 and products over 1 + h |r|, r one of their factors. Which set of up to three terms explains most is
-told from all of them (best subset selection: Miller, Subset Selection in Regression, 2002), by what
-each term changes of the outputs along the model's course; the set is fitted in full, and chosen
-again along the new course until it stays.
+chosen from all of them (best subset selection: Miller, Subset Selection in Regression, 2002), by
+what each term changes of the outputs along the model's course; the set is fitted in full, and
+chosen again along the new course until it stays.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +38,7 @@ _FACTORS, _TERMS, _VARIABLES = 3, 3, 4
 _OF_SIGNAL, _OF_STATES = 5, 3
 #: What h |r| is at the largest r, as it is looked for.
 _STEEP = (0.3, 1.0, 3.0)
-#: A column of which the fitted parameters leave no more than this share tells nothing of its own.
+#: A column of which the fitted parameters leave no more than this share adds nothing new.
 _LEFT = 1e-3
 #: Courses along which terms are chosen, evaluations of every fit.
 _ROUNDS, _EVALUATIONS = 3, 25
@@ -221,7 +221,7 @@ def fitted(
     of: Hypothesis, begin: Fit, component: Component, terms: Sequence[Term],
     start: Mapping[str, float] | None = None,
 ) -> Formula | None:  # fmt: skip
-    """Return a sum of terms beside a hypothesis, all free, from where a fit stands.
+    """Return a sum of terms added to a hypothesis, all free, from the values of a fit.
 
     Raises PsaError.
     """
@@ -238,7 +238,7 @@ def fitted(
 
 
 def formula(of: Hypothesis, free: Formula, place: Place, scale: Scale) -> Formula | None:
-    """Return the formula that explains most beside a hypothesis, less its price; None of none.
+    """Return the formula that explains most added to a hypothesis, less its price; None of none.
 
     It is looked for first along the course of the model with a free function there, which is near
     the truth's.
@@ -305,11 +305,11 @@ def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     basis = screening.independent(screening.whitened_jacobian(fit, colour)[:, kept])
     left, target = screening.without(white, basis), screening.without(target, basis)
     new = np.linalg.norm(left, axis=0) > _LEFT * np.linalg.norm(white, axis=0)
-    told = [trials[k] for k, q in zip(at, new, strict=True) if q]
+    significant = [trials[k] for k, q in zip(at, new, strict=True) if q]
     left, sizes = left[:, new], sizes[new]
     return [
-        [(*told[k], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
-        for rows, gains in _best_subsets(left, target, [t for t, _ in told], price)
+        [(*significant[k], float(c * sizes[k])) for k, c in zip(rows, gains, strict=True)]
+        for rows, gains in _best_subsets(left, target, [t for t, _ in significant], price)
     ]
 
 

@@ -62,7 +62,7 @@ def model_of(
 def fit_free_functions(
     view: View, task: Task, base: Model, effects: Sequence[Attached], scale: Scale
 ) -> list[FreeFunction]:
-    """Fit the most telling free functions beside a hypothesis; return them, the best first.
+    """Fit the most significant free functions added to a hypothesis; return them, the best first.
 
     `base` is the model before its ports were opened, `effects` are the hypothesis' causes.
     """
@@ -107,8 +107,8 @@ def formula_of(
     rows = zip(result.hypothesis.errors, free_function.held, strict=True)
     if any(error > _AS_WELL * before for error, before in rows):
         return None
-    told = _added(result, of, place, base, effects, scale)
-    model = told.model
+    function = _added(result, of, place, base, effects, scale)
+    model = function.model
     if len(whole) < len(of.experiments):
         with suppress(PsaError):
             fit = fit_longer_parts(result.hypothesis.fit, of.experiments, whole)
@@ -116,14 +116,14 @@ def formula_of(
                 model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
     equation = result.equation(port.balance, model.values)
     parameters = estimates(result.component, model)
-    return replace(told, model=model, equation=equation, parameters=parameters)
+    return replace(function, model=model, equation=equation, parameters=parameters)
 
 
 def _added(
     result: Formula, of: Hypothesis, place: Place, base: Model, effects: Sequence[Attached],
     scale: Scale,
 ) -> FreeFunction:  # fmt: skip
-    """Return a fitted function, and what it adds beside the variable that it follows most."""
+    """Return a fitted function, and what it adds, with the variable that it follows most."""
     h, port, experiments = result.hypothesis, place.port, of.experiments
     s = h.fit.model.structure
     term = result.component.equations(Symbols(s.symbols)).add[port.balance]

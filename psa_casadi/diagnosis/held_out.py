@@ -109,13 +109,13 @@ def held_out_gain(
     """Return sum_j m_j ln(E0_j / E_j): what held-out samples give a model over another one [nats].
 
     m_j are the `samples` of an output over the inflation by its noise's `colour`; E0 and E the rms
-    errors `before` and `after`, each with what cannot be told of the output, `straight`, in its
+    errors `before` and `after`, each with what is unknown of the output, `straight`, in its
     unit.
     """
     gained = 0.0
-    for n, item, *rest in zip(samples, colour.each, straight, before, after, strict=True):
+    for n, c, *rest in zip(samples, colour.each, straight, before, after, strict=True):
         old, new = (max(float(np.hypot(e, rest[0])), 1e-300) for e in rest[1:])
-        gained += n / item.inflation * float(np.log(old / new))
+        gained += n / c.inflation * float(np.log(old / new))
     return gained
 
 
@@ -154,7 +154,7 @@ def held_out_parts(
     The parts are those of `psa_casadi.diagnosis.held_out`.
     """
     each = [held_out_residuals(experiments, p) for p in predicted]
-    sums, counts = parts_of(*([r[:, None] for r in item] for item in each))
+    sums, counts = parts_of(*([r[:, None] for r in residuals] for residuals in each))
     return sums[:, :, 0], counts[:, 0]
 
 
@@ -213,7 +213,7 @@ class Share:
 
     @property
     def clipped(self) -> tuple[float, float, float]:
-        """The share and the ends of its interval as they are shown, cut to 0 to 1."""
+        """The share and the ends of its interval as they are reported, cut to 0 to 1."""
         share, low, high = (min(max(v, 0.0), 1.0) for v in (self.share, *self.interval))
         return share, low, high
 
@@ -221,11 +221,11 @@ class Share:
     def percents(self) -> tuple[str, str, str]:
         """The same as percentages without their sign, with decimals where all are near 0 or 1.
 
-        A share that is not 0 is never told as 0, one below 1 told as 100 only from 99.995 on.
+        A share that is not 0 is never shown as 0, one below 1 as 100 only from 99.995 on.
         """
         share, low, high = self.clipped
         off = min(1.0 - self.interval[0], self.interval[1])
-        off = 1.0 if off < 0.0 else off  # beyond what is shown
+        off = 1.0 if off < 0.0 else off  # beyond what is reported
         digits = 0 if off > 0.01 else 1 if off > 0.001 else 2
         while digits < 2 and share < 1.0 and float(f"{100 * share:.{digits}f}") >= 100.0:
             digits += 1
@@ -299,7 +299,7 @@ def _powers(sums: FloatArray, counts: IndexArray) -> FloatArray:
 class Budget:
     """Where the held-out error of the base model above the noise goes.
 
-    `together` is what all causes remove, `causes` what each does beside the others (the model
+    `together` is what all causes remove, `causes` what each does given the others (the model
     fitted again without it leaves so much more), `unnamed` what the best unnamed correction would
     remove of the base's error (nothing named) or beyond the causes.
     """
@@ -337,9 +337,9 @@ def removed_from(
     def errors(arrays: Sequence[FloatArray]) -> list[FloatArray]:
         """Return the errors (n, channels) where any channel is judged, else nan."""
         parts = []
-        for e, y, *item in zip(experiments, arrays, *judged, strict=True):
-            which, each = np.column_stack(item), y.reshape(len(y), -1).T
-            left = np.column_stack([e.errors(j, each[j]) for j in range(len(item))])
+        for e, y, *counted_rows in zip(experiments, arrays, *judged, strict=True):
+            which, each = np.column_stack(counted_rows), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(counted_rows))])
             parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
         return parts
 

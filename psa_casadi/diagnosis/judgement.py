@@ -1,4 +1,4 @@
-"""From what a search found to a diagnosis of any model: do the names stand, and what is left?"""
+"""From the result of a search to a diagnosis of any model: are the names kept, and what is left?"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ _CANCEL = 5.0
 
 @dataclass(frozen=True)
 class Weighed:
-    """Causes against the unnamed `corrections` beside the model without them.
+    """Causes against the unnamed `corrections` of the model without them.
 
     `evidence` of the causes together over that model; `share` that they remove of its held-out
     excess, outputs over their noise, and `each` of every output by itself that it clearly misses.
@@ -73,7 +73,7 @@ def indistinguishable(step: Step, limits: Thresholds) -> tuple[str, ...]:
 
 
 class Judge:
-    """What is said of the steps of a search, each from what they hold and when it is asked.
+    """What follows from the steps of a search, each computed when it is used.
 
     Of records whose output is not `driven` by the input nothing is named. What depends on the kind
     of device are the methods of the first part; a stack has its own.
@@ -99,19 +99,19 @@ class Judge:
 
     @property
     def model(self) -> Model:
-        """The extended model with what stands behind it."""
+        """The extended model with its evidence."""
         raise NotImplementedError
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
-        """Return the unnamed corrections beside a hypothesis."""
+        """Return the unnamed corrections of a hypothesis."""
         raise NotImplementedError
 
     def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
-        """Return what only held-out samples tell that a model misses, and its p value."""
+        """Return what only held-out samples show that a model lacks, and its p value."""
         raise NotImplementedError
 
     def named(self, step: Step) -> Cause:
-        """Return a cause with where it sits and what it changes, beside what all causes have."""
+        """Return a cause with where it sits and what it changes, with what all causes have."""
         raise NotImplementedError
 
     def family(self, effect: Component) -> tuple[str, str]:
@@ -135,7 +135,7 @@ class Judge:
         return self._left[step]
 
     def _shown(self, evidence: float) -> CauseEvidence:
-        """Return what a cause has beside the others that has so much evidence."""
+        """Return what a cause has given the others that has so much evidence."""
         return CauseEvidence(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
 
     @property
@@ -186,7 +186,7 @@ class Judge:
     def _alone(self, less: Hypothesis) -> Weighed:
         """Weigh one cause against what corrections add in its place alone.
 
-        What they add beside all causes as well is no word against one of these.
+        What they add with all causes as well is no word against one of these.
         """
         if less.fit is self.first.fit:
             return self.weighed
@@ -197,7 +197,7 @@ class Judge:
 
     @cached_property
     def _last_corrections(self) -> Sequence[Correction]:
-        """The unnamed corrections beside all causes, where structure remains."""
+        """The unnamed corrections with all causes, where structure remains."""
         return self.corrections(self.last.view.of) if self.last.test.alarm else ()
 
     @cached_property
@@ -211,15 +211,15 @@ class Judge:
             of = self.families[name]
             if sum(f.not_listed for f in of) > sum(sum(f.effects.values()) for f in of):
                 others = {(f.place, f.kind) for f in of if f.not_listed > 0.0}
-                items = [c for c in weighed.corrections if place_and_kind(c) in others]
-                better[name] = max(items, key=lambda c: c.evidence)
+                likely = [c for c in weighed.corrections if place_and_kind(c) in others]
+                better[name] = max(likely, key=lambda c: c.evidence)
         return better
 
     @property
     def unnamed(self) -> set[str]:
         """Causes that are vague, or without which the model is as likely."""
         price = self.limits.price
-        return {*self.unlisted, *(n for n, item in self.each.items() if item.evidence <= price)}
+        return {*self.unlisted, *(n for n, w in self.each.items() if w.evidence <= price)}
 
     @cached_property
     def families(self) -> dict[str, tuple[Family, ...]]:
@@ -277,7 +277,7 @@ class Judge:
 
     @cached_property
     def final_corrections(self) -> Sequence[Correction]:
-        """The unnamed corrections beside the extended model."""
+        """The unnamed corrections of the extended model."""
         if self.final is self.last and self.last.test.alarm:
             return self._last_corrections
         return self.corrections(self.final.view.of) if self.kept else self.weighed.corrections
@@ -290,7 +290,7 @@ class Judge:
 
     @property
     def reported_correction(self) -> Correction | None:
-        """The same in the form that is told."""
+        """The same in the form that is reported."""
         return self.best_correction
 
     @property
@@ -336,7 +336,7 @@ class Judge:
     def cause(self, step: Step, sizes: Sequence[Size], port: str = "") -> Cause:
         """Return a cause: its probability, the share of the error that it removes."""
         name, shares = step.cause.name, {c.what: c for c in self.budget.causes}
-        item, of = shares.get(name), self.families.get(name, ())
+        share, of = shares.get(name), self.families.get(name, ())
         sure = sum(f.effects.get(name, 0.0) for f in of) if of else step.probability[name]
         return Cause(
             effect=name,
@@ -344,7 +344,7 @@ class Judge:
             confidence=float(min(SUREST, sure)),
             parameters=estimates(step.cause, self.model),
             cannot_be_told_from=indistinguishable(step, self.limits),
-            explained_share=0.0 if item is None else item.clipped[0],
+            explained_share=0.0 if share is None else share.clipped[0],
             remedy=step.cause.what_now.code,
             sizes=tuple(sizes),
             port=port,
@@ -353,7 +353,7 @@ class Judge:
         )
 
     def withdrawn(self) -> tuple[Note, ...]:
-        """Return which names were found but not told, and why."""
+        """Return which names were found but not named, and why."""
         names = tuple(s.cause.name for s in self.searched)
         if not names:
             return ()
@@ -436,7 +436,7 @@ class Judge:
 class ModelJudge(Judge):
     """The judge of any model: `base` as it was before the search, `table` effects at its ports.
 
-    `whole` are the records, of which the search may have seen parts.
+    `whole` are the records, of which the search may have used parts.
     """
 
     def __init__(
@@ -469,7 +469,7 @@ class ModelJudge(Judge):
         return model_of(self.base, self.final.fit, effects, self.experiments)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
-        """Fit free functions beside a hypothesis; none beside causes that leave no structure."""
+        """Fit free functions added to a hypothesis; none with causes that leave no structure."""
         view = self.views[of.names]
         if of.causes and not view.test.alarm:
             return ()
@@ -494,19 +494,19 @@ class ModelJudge(Judge):
         Without causes these leave noise of any colour, and the innovations are compared.
         """
         rows = zip(step.fit.channels, self._noise(step)[1], step.view.of.colours, strict=True)
-        for o, noise, item in rows:
+        for o, noise, colour in rows:
             if not step.view.of.causes and not any(e.held_out_whole for e in self.experiments):
-                excess = held_out_within(item, len(step.fit.theta), self.limits)
+                excess = held_out_within(colour, len(step.fit.theta), self.limits)
                 if excess:
-                    output = note("held_out_unlike", output=o.column, ratio=excess.factor)
-                    return output, excess.p_value
+                    finding = note("held_out_unlike", output=o.column, ratio=excess.factor)
+                    return finding, excess.p_value
                 continue
             held = any(e.at(o.number, e.held_out).any() for e in self.experiments)
             rms = missed_rms(self.experiments, step.view.of.predictions, o.number)
             least = self.limits.unseen_ratio_of_records * float(np.hypot(noise, o.straight))
             if held and rms > least:
-                output = note("held_out_unlike", output=o.column, ratio=rms / noise)
-                return output, step.test.p_value
+                finding = note("held_out_unlike", output=o.column, ratio=rms / noise)
+                return finding, step.test.p_value
         return None
 
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
@@ -531,7 +531,7 @@ class ModelJudge(Judge):
 
     @property
     def remarks(self) -> tuple[Note | str, ...]:
-        """What is said of any, which causes cancel each other, which add too little to be told."""
+        """The remarks of any model, which causes cancel each other, which are too small to name."""
         left_out = () if self.doubt else self._left_out()
         return (*super().remarks, *self._cancelling(), *left_out)
 
@@ -554,7 +554,7 @@ class ModelJudge(Judge):
     def _left_out(self) -> tuple[Note, ...]:
         """Return which causes are clearly likelier than the best, but may only correct its form.
 
-        Only where structure remains beside the best.
+        Only where structure remains with the best.
         """
         known, best = self.known, self.last.view.of
         if not best.causes or not self.last.test.alarm:

@@ -280,7 +280,7 @@ class Slope:
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """One record's residual: its size, the views of it, and what is seen.
+    """One record's residual: its size, the views of it, and the findings.
 
     `rms` [m, or counts] is without the mean `mean`; `floor` is the noise, `excess` the share of the
     power above it. The view named "holds" is None in a record without holds, as is `slope`;
@@ -341,8 +341,8 @@ def misfit(record: Record, residual: FloatArray, floor: NoiseFloor) -> Misfit:
     if held is not None and held.significant:
         shares.append((held.share, _held(held, slope, count, unit)))
     lines = tuple((n.frequency, n.name, (n.amplitude, unit)) for n in spectrum.others[:3])
-    output = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
-    shares.append((spectrum.share, output))
+    tones = note("lines", lines=lines, count=len(spectrum.others), share=spectrum.share)
+    shares.append((spectrum.share, tones))
     gain = sorted((row for row in shares if row[0] > WORTH_SAYING), key=lambda row: -row[0])
     findings = [_size(record, rms, mean, floor, excess), *(finding for _, finding in gain)]
     if split is not None and split.repeats > WORTH_SAYING * ground.excess:
@@ -358,7 +358,7 @@ def _steady(
 ) -> views.Ground:
     """Return the residual without its slow part, if the drive turns often in every bin of time.
 
-    A drift would hide smaller views. Under a slow drive the two cannot be told apart, and the
+    A drift would hide smaller views. Under a slow drive the two cannot be separated, and the
     residual stays as it is.
     """
     if not over_time.significant or drive.turns.size < TURNS * over_time.x.size:

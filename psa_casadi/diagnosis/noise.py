@@ -83,7 +83,7 @@ def pooled_level(
 
 
 def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
-    """Return the autoregression of a record's noise where repeats tell it, else None.
+    """Return the autoregression of a record's noise where repeats show it, else None.
 
     Holds do not: what rings or hums during a hold would count as the noise's colour. Where a
     `residual` (n,) is smaller than what differs between repeats, the repeats hold more than noise:
@@ -98,7 +98,7 @@ def known_colour(record: Record, residual: FloatArray) -> FloatArray | None:
 def detection_limit(
     record: Record, error: float, residual: FloatArray, limits: Thresholds = LIMITS
 ) -> float:
-    """Return the rms [m] below which a `residual` (n,) tells nothing of a stack.
+    """Return the rms [m] below which a `residual` (n,) is uninformative of a stack.
 
     It is that of the simulation's own largest `error` [m], of the form that no model has exactly
     (`form_of_range`), and of rounding in the sensor or the file where the residual is hardly
@@ -112,7 +112,7 @@ def detection_limit(
 
 
 def detection_limit_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
-    """Return the rms [m] below which the residuals of a fit tell nothing of a stack."""
+    """Return the rms [m] below which the residuals of a fit are uninformative of a stack."""
     error = max((s.errors[0] for s in fit.simulated if s.errors), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
     pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
@@ -187,7 +187,7 @@ def without_stuck_readings(
     """Return the experiments without repeated readings far from a fit, and how many these are.
 
     Noise repeats a reading by chance here and there; where that is also far from the model, which
-    the record alone cannot tell from a stack that is late, the sensor was stuck.
+    the record alone cannot separate from a stack that is late, the sensor was stuck.
     """
     kept, count = [], 0
     for e, predicted in zip(experiments, fit.predicted(experiments), strict=True):

@@ -90,7 +90,7 @@ def diagnose_ode(
     searched by the score of a stack's diagnosis: evidence less 8 nats for every cause, confirmed by
     held-out samples. These are the records `holdout`, else a quarter of every record in blocks.
     `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be;
-    `effects` are components of your own, which are searched beside these: each has a gain and adds
+    `effects` are components of your own, which are searched with these: each has a gain and adds
     a term to a port (`applied_u` of an input u, `rate_x` of a state x, `shown_y` of an output y).
     Other words are those of `identify`. `watch` gets every hypothesis of the search (`Tried`).
 
@@ -106,7 +106,7 @@ def diagnose_ode(
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
-    for base, runs, _, output in ways(
+    for base, runs, _, choices in ways(
         model,
         inputs,
         made,
@@ -118,7 +118,7 @@ def diagnose_ode(
         if base.interrupted:
             raise KeyboardInterrupt
         table = _table(base, runs, effects, leave_out, of_zeros)
-        way = _Way(base, runs, output, table, made, known_hold, progress, watch, [base])
+        way = _Way(base, runs, choices, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
         if _settled(judge):
@@ -139,14 +139,14 @@ def diagnose_ode(
 
 def _entering(of: Hypothesis) -> tuple[Note, ...]:
     """Return where noise enters a model, as far as it does not come from its sensors."""
-    rows = [(f.column, item) for f, item in zip(of.fit.channels, of.colours, strict=True)]
+    rows = [(f.column, c) for f, c in zip(of.fit.channels, of.colours, strict=True)]
     return tuple(
         note(
             "noise_enters", output=column, place=w.place, rate=w.rate, rms=(w.rms, w.unit),
-            time=w.time, nats=item.gained,
+            time=w.time, nats=c.gained,
         )
-        for column, item in rows
-        if (w := item.entering) is not None
+        for column, c in rows
+        if (w := c.entering) is not None
     )  # fmt: skip
 
 
@@ -184,7 +184,7 @@ class _Way:
     so_far: list[Fit]
 
     def searched(self, texts: Collection[str]) -> tuple[ModelJudge, tuple[Note, ...]]:
-        """Return the judge of what is found; parameters may change where the rest leaves much."""
+        """Return the judge of the result; parameters may change where the rest leaves much."""
         fixed = [
             n for n, e in self.table.items() if n in texts or e.component.kind != "changing gain"
         ]
@@ -245,7 +245,7 @@ def _better(new: ModelJudge, old: ModelJudge) -> bool:
 
 
 def _settled(judge: ModelJudge) -> bool:
-    """Whether parts of records would tell no more than a search in them."""
+    """Whether parts of records would show no more than a search in them."""
     if judge.verdict not in _OPEN:
         return settled(judge.final.fit, judge.experiments)
     best = judge.last.fit, judge.experiments
@@ -254,8 +254,8 @@ def _settled(judge: ModelJudge) -> bool:
 
 def _coloured(judge: ModelJudge) -> bool:
     """Whether a base that lacks nothing leaves noise that is not white."""
-    item = judge.first.view.of.colours
-    return judge.verdict == "adequate" and any(c.autoregression.size for c in item)
+    colours = judge.first.view.of.colours
+    return judge.verdict == "adequate" and any(c.autoregression.size for c in colours)
 
 
 _Tasks = Callable[[tuple[Experiment, ...]], Task]
@@ -289,7 +289,7 @@ def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> Se
 def _held_instead(
     known: SearchState, base: Fit, task_of: _Tasks
 ) -> tuple[SearchState, tuple[Note, ...]] | None:
-    """Return what is found with inputs the other way between samples, if that is likelier.
+    """Return the result with inputs the other way between samples, if that is likelier.
 
     Looked for where the answer is likelier so, or has straight lines that are late by half a
     sampling interval. A cause counts as much as for the choice itself.
@@ -317,9 +317,9 @@ def _late(base: Fit) -> set[str]:
 
 
 def _of_whole(known: SearchState, task: Task) -> SearchState | None:
-    """Return what was found in parts of records as hypotheses of whole ones.
+    """Return the results of parts of records as hypotheses of whole ones.
 
-    None where what was found does not follow these.
+    None where the result does not follow these.
     """
     best, parts = known.answer, known.task.experiments
     task.progress("fitting the whole records")

@@ -16,7 +16,7 @@ from psa_casadi.units import FloatArray
 Structure = Literal["correlation", "line", "drive", "size", "effect"]
 
 _LAGS = 25
-#: So many times more rarely a correlation counts beside a residual's own colour.
+#: So many times more rarely a correlation counts with the residual's own colour.
 _LEFT = 100.0
 #: Squares of the residual over their mean that count at most.
 _MOST = 9.0
@@ -24,7 +24,7 @@ _MOST = 9.0
 
 @dataclass(frozen=True)
 class Omnibus:
-    """Probability of the residual under noise alone, and the test that says so.
+    """Probability of the residual under noise alone, and the deciding test.
 
     `structure` is what that test finds, `output` the one of several whose residual it is. `excess`
     is the share of the residual's power above the noise; `size` [m] the rms of what the test finds,
@@ -42,7 +42,7 @@ class Omnibus:
 
     @property
     def alarm(self) -> bool:
-        """Whether something besides noise is in the residual, large enough to be told."""
+        """Whether something besides noise is in the residual, above the detection limit."""
         return self.p_value < self.alarms_below and self.size > self.detection_limit
 
     @property
@@ -70,7 +70,7 @@ def omnibus(
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
     misfit is not. Where the colour is the residual's `own`, its jitter is for the size, and its
     order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share
-    of the residual's power above the noise `floor` [m]; what is seen must be larger than what is
+    of the residual's power above the noise `floor` [m]; what it finds must be larger than what is
     `knowable` [m]; `lengths` are the records' numbers of samples.
     """
     white = colour.whiten(residual)
@@ -82,12 +82,12 @@ def omnibus(
     }
     if not own:
         tests["size"] = _sizes(white, voltage, time, lengths)
-    observed, (p, share) = min(tests.items(), key=lambda item: item[1][0])
+    structure, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))
     size = float(np.sqrt(share * power))
     excess = max(0.0, 1.0 - floor**2 / power) if power > 0 else 0.0
     p = min(1.0, len(tests) * p)
-    return Omnibus(p, excess, observed, size, detection_limit, alarms_below)
+    return Omnibus(p, excess, structure, size, detection_limit, alarms_below)
 
 
 def whiteness(white: FloatArray) -> tuple[float, float]:
@@ -175,7 +175,7 @@ def _since_reversal(u: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatA
 
 
 def _f_test(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Return the p-value that columns x (n, k) tell nothing of y (n,), and their share of it."""
+    """Return the p-value that columns x (n, k) explain nothing of y (n,), and their share of it."""
     coefficients, _, rank, _ = np.linalg.lstsq(x, y, rcond=None)
     explained = float(np.sum((x @ coefficients) ** 2))
     rest = float(y @ y) - explained

@@ -65,14 +65,14 @@ class OwnColour:
     def nats(self, straight: float = 0.0) -> float:
         """Ln of the likelihood, up to a constant, less p/2 ln n for p coefficients.
 
-        What is `straight` is not told of an output and adds to the level.
+        What is `straight` is unknown of an output and adds to the level.
         """
         level = float(np.hypot(self.level, straight))
         return _nats(self.samples, level, self.autoregression.size) - self.lost + self.gained
 
     @property
     def colour(self) -> Colour:
-        """It as the colour of the fitted samples, which begins anew after every gap."""
+        """It as the colour of the fitted samples, which restarts after every gap."""
         each = (self.autoregression,) * len(self.runs)
         level = max(self.level, 1e-15)
         return Colour(each, level, self.runs, known_start=False, spread=self.spread)
@@ -150,7 +150,7 @@ def own_colour(
 def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
     """Return the ends of all windows without gaps in all records that are longer than an order.
 
-    And where the records begin, and that order, the highest one that so many windows can tell.
+    And where the records begin, and that order, the highest one that so many windows determine.
     """
     used = np.concatenate(fitted).astype(np.bool_)
     starts = np.cumsum([0, *(len(rows) for rows in fitted[:-1])])

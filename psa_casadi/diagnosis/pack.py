@@ -55,11 +55,11 @@ class Pack:
                 rows.append(replace(result, output=f.column if fit.further else ""))
         p = min(1.0, len(rows) * min(r.p_value for r in rows))
         worst = min(rows, key=lambda r: (not r.alarm, r.p_value))
-        output = worst.p_value * len(rows)
-        return replace(worst, p_value=min(1.0, output if worst.alarm else p))
+        corrected = worst.p_value * len(rows)
+        return replace(worst, p_value=min(1.0, corrected if worst.alarm else p))
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
-        """Return whether what a direction promises to remove can be told of the device."""
+        """Return whether what a direction promises to remove exceeds the detection limit."""
         return any(f.rms > f.straight for f in fit.channels)
 
     def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
@@ -73,7 +73,7 @@ class Pack:
 
 
 class StackPack(Pack):
-    """A stack: one voltage, a displacement and columns beside it."""
+    """A stack: one voltage, a displacement and further columns."""
 
     is_stack = True
 
@@ -110,7 +110,7 @@ class StackPack(Pack):
         return test
 
     def shows(self, fit: Fit, promise: float, test: Omnibus) -> bool:
-        """Return whether the power [m^2] that a direction promises to remove can be told."""
+        """Return whether the power [m^2] that a direction promises exceeds the detection limit."""
         return promise > test.detection_limit**2
 
     def exceeds_detection_limit(self, fit: Fit, before: Fit, removed: float, least: float) -> bool:
@@ -142,7 +142,7 @@ STACK = StackPack()
 
 @dataclass(frozen=True)
 class Task:
-    """The records, the effects to search, what knows the device, the method, and who is told.
+    """The records, the effects to search, what knows the device, the method, and the observers.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
     interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made. Of a
@@ -170,7 +170,7 @@ class Task:
         return self.pack.is_stack and shows_ringing(self.experiments)
 
     def indistinguishable(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
-        """Groups of effects that these records cannot tell apart but by forms nobody knows."""
+        """Groups of effects that these records cannot separate but by forms nobody knows."""
         return same_curves(self.experiments, self.table, fit) if self.pack.is_stack else ()
 
 

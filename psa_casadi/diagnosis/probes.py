@@ -43,7 +43,7 @@ from psa_casadi.simulation.simulate import Way, record_inputs
 from psa_casadi.simulation.start import is_stack, memory_names
 from psa_casadi.units import FloatArray
 
-#: Peaks that are tried, and how much finer than 1/duration their frequencies are told.
+#: Peaks that are tried, and how much finer than 1/duration their frequencies are resolved.
 _PEAKS, _FINER = 4, 8
 #: Bins of the displacement; periods between so many of them over the range are tried.
 _BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
@@ -251,7 +251,7 @@ def laws_of(
 def screened_with(
     model: Model, effects: Sequence[Component], laws: Mapping[str, tangent.Law]
 ) -> list[Model]:
-    """Return the models that a screening simulates, beside the one that it is of."""
+    """Return the models that a screening simulates, besides the one that it is of."""
     added = tangent.opened(model, laws.values())
     whole = [model.with_effect(e) for e in effects if e.name not in laws]
     return [added, *whole] if added is not model else whole
@@ -418,8 +418,8 @@ def _changes(
         if not e.stop:
             return tangent.Answer(np.zeros((0, len(outputs), len(moved))), 0.0)
         if others is not None:
-            item = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
-            return item if step else replace(item, y=item.y * sizes)
+            tangent_change = others.answer(stepped, e, k, rest | memory[k], way, finite=bool(step))
+            return tangent_change if step else replace(tangent_change, y=tangent_change.y * sizes)
         traced = trace_record(
             stepped, e.record, rest | memory[k], () if step else tuple(moved),
             stop=e.stop, way=way, by_start=False, outputs=outputs,
@@ -436,7 +436,7 @@ def _changes(
             total = sum(
                 factor * every[k].y[at[: e.stop], outputs.index(name)] for factor, name in rows
             )
-            if step:  # what is shown beyond what the fit shows
+            if step:  # the output beyond that of the fit
                 offset = 0.0 if f.number else fit.offset(k)
                 readings = e.measured(f.number)[at]
                 total = total + (offset - readings)[:, None]
@@ -473,7 +473,7 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
         np.column_stack([d.column for d in directions]) @ gains,
         one_sided=False,
         finite=False,
-        further=tuple(np.column_stack(item) @ gains for item in every),
+        further=tuple(np.column_stack(columns) @ gains for columns in every),
     )
 
 
@@ -487,7 +487,7 @@ def declared(directions: Sequence[Direction]) -> FloatArray:
 class Span:
     """Directions of a span: the `gram` (m, m) of their unit vectors, their `norms` over the noise.
 
-    `false_alarm` is the chance that noise makes a direction seen.
+    `false_alarm` is the chance that noise makes a direction significant.
 
     Residuals come as projections t (..., m) on the unit vectors, over the noise level.
     """

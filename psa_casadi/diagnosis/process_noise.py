@@ -6,8 +6,8 @@ Linear about the model's course, with the noise w of one place and white noise v
 
 A Kalman filter turns the residual e of an output into innovations, which are white if that is what
 happened; their likelihood is that of the prediction-error form (Ljung, System Identification, 2nd
-ed. 1999, section 7.4; Kristensen, Madsen and Jorgensen, Automatica 40 (2004) 225). phi tells white
-noise, noise that is correlated over a time, and a walk apart.
+ed. 1999, section 7.4; Kristensen, Madsen and Jorgensen, Automatica 40 (2004) 225). phi separates
+white noise, noise that is correlated over a time, and a walk.
 """
 
 from collections.abc import Mapping, Sequence
@@ -101,10 +101,10 @@ def entering(
     prior, (at, _, _) = fit.unknowns.prior[: columns.shape[1]], windows(used)
     states = len(fit.model.state_names) - sum(len(c.states) for c in fit.model.effects)
     tried = _tried(parts[0], len(fit.model.input_names) + states)
-    few, observed = _first(parts, used)
+    few, few_used = _first(parts, used)
     if not tried.place.size or not few:
         return item
-    chosen = _found(few, observed, tried, prior).nats(np.flatnonzero(np.concatenate(observed)))
+    chosen = _found(few, few_used, tried, prior).nats(np.flatnonzero(np.concatenate(few_used)))
     tried = tried.neighbours(int(np.argmax(chosen)))
     result = _found(parts, used, tried, prior)
     best = int(np.argmax(result.nats(at)))
@@ -221,9 +221,9 @@ def _found(
     weight = np.where(known, 1.0 / np.where(known, prior, 1.0) ** 2, 0.0)
     moves = np.zeros((white.shape[1], len(prior)))
     for b in range(len(moves)):
-        item = columns[at, b]
-        normal = item.T @ item + np.mean(white[at, b] ** 2) * np.diag(weight)
-        moves[b] = np.linalg.lstsq(normal, item.T @ white[at, b], rcond=1e-12)[0]
+        part = columns[at, b]
+        normal = part.T @ part + np.mean(white[at, b] ** 2) * np.diag(weight)
+        moves[b] = np.linalg.lstsq(normal, part.T @ white[at, b], rcond=1e-12)[0]
         white[:, b] -= columns[:, b] @ moves[b]
     return _Found(white, spread, moves)
 
@@ -267,7 +267,7 @@ def _first(
     parts: Sequence[_Linear], used: Sequence[BoolArray]
 ) -> tuple[list[_Linear], list[BoolArray]]:
     """Return the first samples of records, as many as choose."""
-    left, few, observed = _CHOOSING, [], []
+    left, few, few_used = _CHOOSING, [], []
     for p, at in zip(parts, used, strict=True):
         n = min(len(at), left)
         if n < 2 or not at[:n].any():
@@ -276,15 +276,15 @@ def _first(
             p, phi=p.phi[: n - 1], before=p.before[: n - 1], after=p.after[: n - 1],
             c=p.c[:n], rows=p.rows[:n],
         ))  # fmt: skip
-        observed.append(at[:n])
+        few_used.append(at[:n])
         left -= n
-    return few, observed
+    return few, few_used
 
 
 def _tried(of: _Linear, count: int) -> _Noises:
     """Return noises of the first places, and of all powers and times.
 
-    A power is told by the effect on the output.
+    A power is set by the effect on the output.
     """
     places, time = np.arange(count), _TIMES * of.step * len(of.c)
     grid = _Noises(

@@ -72,11 +72,11 @@ _NEAR, _LEAST, _TURNS = 0.1, 0.25, 0.01
 _MORE, _REPEATS = (1.5, 2.0), 1e-3
 #: A test's share of what is left may be larger than what is open.
 _DEAF = 2.0
-#: Verdicts beside which no parameter is asked for; parameters that no healthy record may tell, but
+#: Verdicts with which no parameter is fitted; parameters that no healthy record may determine, but
 #: a change of which shows.
 _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
 #: A parameter has changed where it leaves no more than this share of what has; it replaces causes
-#: where it leaves less than this share of what they do, told from a share of the noise on.
+#: where it leaves less than this share of what they do, from a share of the noise on.
 _REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
 #: Parameters that leave less than so many times the best one explain as much.
 _ALIKE = 1.02
@@ -106,15 +106,15 @@ class Healthy:
         And the number of places at which such a voltage was played before.
         """
         each = self._forms(records)
-        columns = [np.hstack(item) for item in zip(*each, strict=True)]
-        which = np.repeat(np.arange(len(each)), [item[0].shape[1] for item in each])
-        items = [np.isfinite(r) for r in self.residuals]
-        rows = np.vstack([c[s] for c, s in zip(columns, items, strict=False)])
-        target = np.concatenate([r[s] for r, s in zip(self.residuals, items, strict=True)])
+        columns = [np.hstack(parts) for parts in zip(*each, strict=True)]
+        which = np.repeat(np.arange(len(each)), [parts[0].shape[1] for parts in each])
+        valid = [np.isfinite(r) for r in self.residuals]
+        rows = np.vstack([c[s] for c, s in zip(columns, valid, strict=False)])
+        target = np.concatenate([r[s] for r, s in zip(self.residuals, valid, strict=True)])
         weights = _ridge(rows, target, which)
-        output = [c @ weights for c in columns[len(self.experiments) :]]
-        result = [self._again(r, item) for r, item in zip(records, output, strict=True)]
-        return [item for item, _ in result], min(n for _, n in result)
+        smooth = [c @ weights for c in columns[len(self.experiments) :]]
+        result = [self._again(r, parts) for r, parts in zip(records, smooth, strict=True)]
+        return [parts for parts, _ in result], min(n for _, n in result)
 
     def _forms(self, records: Sequence[Record]) -> list[list[FloatArray]]:
         """Return the columns (n, k) of every form, along the healthy records and further ones."""
@@ -123,15 +123,15 @@ class Healthy:
         signals = Signals(every, [e.record.voltage for e in every], responses(self.fit, every))
         shortest = min(r.duration for r in plain)
         settled = time_constants([e.record for e in every]) < shortest / _SETTLES
-        items = []
+        forms = []
         for kind in (k for k in KINDS if (k.name, k.port) in _FORMS):
             parts = [kind.columns(signals, k)[r.n :] for k, r in enumerate(plain)]
             if kind.name == "relaxation":
                 parts = [p[:, settled] for p in parts]
             largest = np.std(np.vstack(parts[: len(self.experiments)]), axis=0)
             scale = kind.shape(parts[0].shape[1]) / max(float(largest.max(initial=0.0)), 1e-300)
-            items.append([(p - p.mean(axis=0)) * scale for p in parts])
-        return items
+            forms.append([(p - p.mean(axis=0)) * scale for p in parts])
+        return forms
 
     def shows(self, record: Record) -> BoolArray:
         """Return where a record's voltage is as it was in the healthy ones before (n,).
@@ -149,12 +149,12 @@ class Healthy:
         What is `values` without, where it was not; and the number of places.
         """
         total, count, places = np.zeros(record.n), np.zeros(record.n), 0
-        for e, item in zip(self.experiments, self.residuals, strict=True):
+        for e, residual in zip(self.experiments, self.residuals, strict=True):
             if abs(e.record.sample_time / record.sample_time - 1.0) > _STEP:
                 continue
             for lag in _lags(record.voltage, e.record.voltage):
                 first, last = max(0, -lag), min(record.n, e.record.n - lag)
-                apart = item[first + lag : last + lag] - values[first:last]
+                apart = residual[first + lag : last + lag] - values[first:last]
                 there = np.isfinite(apart)
                 total[first:last] += np.where(there, apart - np.nanmean(apart), 0.0)
                 count[first:last] += there
@@ -182,13 +182,13 @@ class Healthy:
 
     def _unlike(self, part: Record, others: tuple[Experiment, ...]) -> float:
         """Return the power [m^2] beyond the noise of what others do not predict of a record."""
-        item = fit(
+        other = fit(
             self.fit.model, others, self.fit.unknowns.names,
             sigma=noise_levels(others), evaluations=_EVALUATIONS,
         )  # fmt: skip
-        (rest,), _ = Healthy(item, others).since([part]).taken_off(1)
+        (rest,), _ = Healthy(other, others).since([part]).taken_off(1)
         new = [whole(rest)]
-        left = fit(item.model, new, (), sigma=noise_levels(new)).residuals
+        left = fit(other.model, new, (), sigma=noise_levels(new)).residuals
         (floor,) = noise_floor([rest], [left])
         return float(np.mean(left**2)) - floor.level**2
 
@@ -198,16 +198,16 @@ class Healthy:
         Raises InputError where hardly a new sample is like a healthy one.
         """
         added, places = self.adds(records)
-        displayed = tuple(self.shows(r) for r in records)
-        for r, observed in zip(records, displayed, strict=True):
-            if np.mean(observed) < _LEAST:
+        covered = tuple(self.shows(r) for r in records)
+        for r, share in zip(records, covered, strict=True):
+            if np.mean(share) < _LEAST:
                 raise InputError(
                     f"{r.name}: the voltage is as in the reference, in value, rate and last"
-                    f" reversals, for {np.mean(observed):.0%} of the samples; what has changed"
+                    f" reversals, for {np.mean(share):.0%} of the samples; what has changed"
                     " cannot be told from the rest. Record the device with the voltage of the"
                     " reference."
                 )
-        return Since(self, tuple(records), tuple(added), displayed, places)
+        return Since(self, tuple(records), tuple(added), covered, places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,19 +256,19 @@ class Since:
         return replace(method, thresholds=limits)
 
     def concluded(self, method: Method, diagnosed: Diagnosed) -> StackDiagnosis:
-        """Diagnose by a method, and tell what was taken off and which parameter has changed.
+        """Diagnose by a method, and report what was taken off and which parameter has changed.
 
         What is left of no more
         than is open is no change. A parameter takes the place of the causes where it leaves clearly
-        less beside the noise than they do, and a stiffness where it leaves as little; what it
-        leaves is its form. Another that leaves as little is told beside them.
+        less above the noise than they do, and a stiffness where it leaves as little; what it
+        leaves is its form. Another that leaves as little is reported with them.
         """
         result, rms = diagnosed(method, ()), np.sqrt(np.mean(np.concatenate(self.added) ** 2))
         noise, base, least = result.noise_floor_rms_m, result.base_fit, self.open**2
         excess = base.rms**2 - noise**2
         if excess < least and result.verdict not in _NOTHING:
             result = diagnosed(self.deaf(method, self.open), ())
-        items = [
+        notes = [
             note("since", removed=(float(rms), "m"), places=self.places, open=(self.open, "m"),
                  shown=float(np.mean(np.concatenate(self.covered))))
         ]  # fmt: skip
@@ -286,8 +286,8 @@ class Since:
                     result = diagnosed(deaf, (name,))
                 unit = base.model.parameter(name).unit
                 values = (base.model.values[name], best.model.values[name])
-                items.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
-        return replace(result, remarks=(*items, *result.remarks))
+                notes.append(note("since_moved", name=name, values=values, unit=unit, alone=alone))
+        return replace(result, remarks=(*notes, *result.remarks))
 
     def _moved(self, stack_diagnosis: StackDiagnosis) -> Fit | None:
         """Fit every parameter of the base alone; return the fit that leaves least.
@@ -319,8 +319,8 @@ def _place(record: Record, span: float) -> FloatArray:
     last, before, then = (twice.voltage[turns[np.maximum(after - j, 0)]] for j in (1, 2, 0))
     lasts = twice.time[turns[after]] - twice.time[turns[after - 1]]
     rate = np.abs(then - last) / np.maximum(lasts, record.sample_time)
-    output = _NEAR * np.log(np.maximum(rate, 1e-9 * span)) / np.log(4.0)
-    return np.column_stack([twice.voltage[k] / span, last / span, before / span, output])
+    steepness = _NEAR * np.log(np.maximum(rate, 1e-9 * span)) / np.log(4.0)
+    return np.column_stack([twice.voltage[k] / span, last / span, before / span, steepness])
 
 
 def _twice(record: Record) -> Experiment:

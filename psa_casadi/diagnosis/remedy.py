@@ -39,7 +39,7 @@ _HELD, _STEP = (10.0, 600.0), 0.02
 _SAMPLES, _SLOW = 200, 1.0
 #: Tolerance of the runs over the range of the displacement: both err alike.
 _RTOL = 1e-5
-#: Resonances that are told, and the smallest change of the response there that counts.
+#: Resonances that are listed, and the smallest change of the response there that counts.
 _MOST, _TOLD = 3, 0.02
 #: Period [s] of a model's loops that has no records, and its warming [K] in them.
 _PERIOD, _WARMING = 0.25, 1.0
@@ -105,7 +105,7 @@ def _state(model: Model, start: Mapping[str, float]) -> FloatArray:
 
 
 def _shown(model: Model, t: FloatArray, u: FloatArray, x0: FloatArray | None = None) -> FloatArray:
-    """Return what a model shows (n,), from rest if no start is given."""
+    """Return a model's output (n,), from rest without a start."""
     started = start_on(model, t, u).x if x0 is None else x0
     steps, _ = accurate(model, t, u, started, rtol=_RTOL, hold="linear")
     return steps.y[:, model.output_names.index(output_of(model) or "displacement")]
@@ -133,7 +133,7 @@ def _hold(on: Model, off: Model, drive: Drive) -> list[Figure]:
 
 
 def _slow_loops(on: Model, off: Model, drive: Drive) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return d on the last way up and down, and what is shown without the effect on the former.
+    """Return d on the last way up and down, and the output without the effect on the former.
 
     All (n,) over voltages that rise evenly.
     """
@@ -172,7 +172,7 @@ def _resonance(on: Model, off: Model, drive: Drive) -> list[Figure]:
     with_it, without = linear_part(on), linear_part(off)
     poles = np.linalg.eigvals(with_it.a)
     ringing = np.unique(np.abs(poles[np.abs(poles.imag) > 1e-6 * np.abs(poles)]))
-    near = np.geomspace(0.9, 1.1, _SAMPLES + 1)  # the peak lies beside the pole
+    near = np.geomspace(0.9, 1.1, _SAMPLES + 1)  # the peak lies near the pole
     figures = []
     for natural in ringing.tolist():
         omega = natural * near

@@ -36,7 +36,7 @@ NOISE = note("noise_only")
 class Cause:
     """A named cause: where it sits, how sure, how large, and what else it may be.
 
-    `explained_share` is what it removes of the held-out error above the noise, beside the others.
+    `explained_share` is what it removes of the held-out error above the noise, given the others.
     `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
     effect declares. Of any model, `port` is where it adds to the equations. `families` are the
     places and kinds that it may be of, the most probable first; `confidence` counts what is not
@@ -88,7 +88,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """An effect of practical size that the records could not have shown."""
+    """An effect of practical size that the records could not show."""
 
     effect: str
     smallest_detectable_gain: float
@@ -103,7 +103,7 @@ class BlindSpot:
 
 @dataclass(frozen=True)
 class Remaining:
-    """What is left: whether it is noise, and what is seen in it where it is not."""
+    """What is left: whether it is noise, and what shows in it where it is not."""
 
     white: bool
     p_value: float
@@ -111,7 +111,7 @@ class Remaining:
 
     @property
     def where(self) -> str:
-        """What is seen, as a sentence."""
+        """What shows, as a sentence."""
         return str(self.finding)
 
 
@@ -145,7 +145,7 @@ class Contender:
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """The extended model with another effect `instead` of a `cause` that it cannot be told from.
+    """The extended model with another effect `instead` of an indistinguishable `cause`.
 
     One of the two belongs to the plant, the other to sensor or environment. `rms_ratio` is the
     residual's rms over that of the extended model; the displacements of the two exported plants
@@ -227,16 +227,14 @@ class Diagnosis(Reported):
     families: tuple[Family, ...] = ()
     noise_kinds: tuple[NoiseFound, ...] = ()
 
-    def with_noise(self, noise: Sequence[NoiseFound], statement: Sequence[Note | str]) -> Self:
-        """Return it with the noise that its extended model leaves, and what is `statement` beside.
+    def with_noise(self, noise: Sequence[NoiseFound], remarks: Sequence[Note | str]) -> Self:
+        """Return it with the noise that its extended model leaves, and what is `remarks` beside.
 
         A reading that jumps a few times and stays there is no noise: nothing is `adequate` then.
         """
         notes = notes_of(noise)
         jumps = [t for t in notes if t.values["kind"] == "steps"]
-        result = replace(
-            self, remarks=(*self.remarks, *statement, *notes), noise_kinds=tuple(noise)
-        )
+        result = replace(self, remarks=(*self.remarks, *remarks, *notes), noise_kinds=tuple(noise))
         if not jumps or self.verdict != "adequate":
             return result
         left = Remaining(False, self.missed.p_value, jumps[0])
@@ -362,7 +360,7 @@ class StackDiagnosis(Diagnosis):
     `base` and `extended` (n,) are its predictions [m]. `noise` is the floor of every record;
     `misfit` and `remainder` are what base and extended model get wrong in it, for records with
     enough samples. `contenders` are the fitted rivals of an ambiguous verdict. `alternatives` are
-    models for causes of which the records do not tell whether an exported plant holds them.
+    models for causes of which the records do not show whether an exported plant holds them.
     `columns` say what each further column of the records decided.
     """
 
@@ -458,7 +456,7 @@ class DiagnosisInterrupted(KeyboardInterrupt):
 
 
 def _misfit(m: Misfit) -> dict[str, Any]:
-    """Return what is seen in one record's residual: shares of its power above the noise."""
+    """Return what shows in one record's residual: shares of its power above the noise."""
     return {
         "record": m.record,
         "rms": m.rms,

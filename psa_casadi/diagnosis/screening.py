@@ -11,10 +11,10 @@ regression) costs one small system of equations each, over products of direction
     ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
 
 S are sums of squares of n whitened residuals, of which k unknowns of the model before have taken
-their part, the noise level being the data's own; H is the information on the unknowns that the
-effect adds, those of the model before projected out, and P their prior standard deviations. An
-unknown that the data do not tell costs nothing, a sharp one costs what its prior range is wider
-than its interval (MacKay, Neural Computation 4 (1992), 415).
+their part, the noise level being estimated from the data; H is the information on the unknowns that
+the effect adds, those of the model before projected out, and P their prior standard deviations. An
+unknown that the data leave open costs nothing, a sharp one costs what its prior range is wider than
+its interval (MacKay, Neural Computation 4 (1992), 415).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -80,7 +80,7 @@ class Screening:
         return best
 
     def leading(self) -> list[str]:
-        """Return the effects worth a fit, the best one first."""
+        """Return the effects that are to be fitted, the best one first."""
         best = self.best_by_effect()
         if not best:
             return []
@@ -283,7 +283,7 @@ def _threshold(
     return float(np.quantile(largest, 1.0 - false_alarm))
 
 
-#: A direction of which less than this is new beside the fitted parameters is left out.
+#: A direction of which less than this is new besides the fitted parameters is left out.
 _NEW = 1e-4
 
 
@@ -312,21 +312,21 @@ def _ways(
 
     `gram` is that of unit directions, `sizes` are theirs over the noise level, 0 where the fitted
     parameters can follow one. `costs` stand at the first place of a span: what the evidence loses
-    by its weights but for the best told combination. A span that lacks a weight is left out.
+    by its weights but for the best determined combination. A span that lacks a weight is left out.
     """
     table: dict[str, list[list[int]]] = {}
     weak, cost = np.full(len(trials), _NEW**2), np.zeros(len(trials))
     for places in spans(trials):
-        first, item = trials[places[0]], sizes[places]
+        first, of_span = trials[places[0]], sizes[places]
         if first.weight:
-            span = Span(gram[np.ix_(places, places)], item, limits.false_alarm)
-            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * item, _NEW) ** 2
+            span = Span(gram[np.ix_(places, places)], of_span, limits.false_alarm)
+            weak[places] += 1.0 / np.maximum(LINEAR_PRIOR * of_span, _NEW) ** 2
             cost[places[0]] = float(np.sum(span.penalties[:-1]))
-        if first.weight or item[0]:
+        if first.weight or of_span[0]:
             table.setdefault(first.effect.name, []).append(places)
-    most = {name: max(map(len, item)) for name, item in table.items()}
-    whole = {n: [p for p in item if len(p) == most[n]] for n, item in table.items()}
-    return {n: np.array(item, dtype=np.int64) for n, item in whole.items()}, weak, cost
+    most = {name: max(map(len, of_span)) for name, of_span in table.items()}
+    whole = {n: [p for p in of_span if len(p) == most[n]] for n, of_span in table.items()}
+    return {n: np.array(of_span, dtype=np.int64) for n, of_span in whole.items()}, weak, cost
 
 
 def _together(
@@ -401,7 +401,7 @@ def evidence(before: Fit, after: Fit, colour: Colour) -> float:
 
     The log-likelihoods of displacement and further columns add up, each with its own noise level.
     """
-    # what is left beside the unknowns to tell the noise
+    # what is left besides the unknowns to estimate the noise
     share = max(len(before.residuals) - before.unknowns.size, 0) / len(before.residuals)
     gained = share * _gained(before.residuals, after.residuals, colour)
     gained += sum(further_gains(before, after, colour).values())
@@ -416,7 +416,7 @@ def occam(before: Fit, after: Fit, colour: Colour, levels: Sequence[float]) -> f
     `levels` are those of the noise in every channel.
     """
     rows = zip(colour.each, after.channels, levels, strict=True)
-    jacobian = np.concatenate([c.whiten(f.jacobian) / max(item, 1e-300) for c, f, item in rows])
+    jacobian = np.concatenate([c.whiten(f.jacobian) / max(level, 1e-300) for c, f, level in rows])
     known, other = before.unknowns, after.unknowns
     added = [k for k, n in enumerate(other.names) if n not in known.names]
     for record, states in enumerate(other.started):
@@ -448,7 +448,7 @@ def _level(residual: FloatArray, colour: Colour, straight: float) -> float:
 
 
 def estimated(before: Fit, screening: Screening) -> dict[str, float]:
-    """Return every effect's ln B as its trial directions tell it, without a full fit.
+    """Return every effect's ln B as its trial directions estimate it, without a full fit.
 
     Linear in the gain g with prior N(0, s^2), s = `LINEAR_PRIOR` ordinary sizes, and estimated to
     sigma: ln B = (n - k)/2 ln(S / (S - D)) - 1/2 ln(1 + s^2/sigma^2), D the decrease of S; averaged

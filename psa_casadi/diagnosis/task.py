@@ -1,7 +1,7 @@
 """What a search for causes works on, by which method, and every constant that decides.
 
-What a search does with its time (how many fits, from how many starts) stands where it is done;
-these here decide what is said. `python -m tests.studies ablation` doubles and halves each.
+What a search does with its time (how many fits, from how many starts) is set where it is done;
+these here decide the verdict. `python -m tests.studies ablation` doubles and halves each.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from psa_casadi.records.split import Experiment, fitted
 class Thresholds:
     """The deciding constants.
 
-    Seen at all:
+    Detection:
 
     * `false_alarm`: chance that clean data exceed the threshold of the screening, over all its
       directions. Convention; 0 of 100 clean records were named.
     * `alarm`: probability below which the tests of a residual alarm. Convention.
-    * `unseen_alarm`, `unseen_ratio`, `unseen_ratio_of_records`: held-out errors tell that something
+    * `unseen_alarm`, `unseen_ratio`, `unseen_ratio_of_records`: held-out errors show that something
       is missing below this probability, and by this ratio of their rms to that of the fit, of whole
-      records to their noise. 200 draws each of white and coloured noise: none told.
+      records to their noise. 200 draws each of white and coloured noise: none alarmed.
     * `form_of_range`: share of the range below which no difference between a stack and a model is
       of practical use. 64 simulated records of named stacks are adequate with it.
     * `dithered`: a residual above this multiple of the rounding's rms holds noise enough (a fifth
@@ -58,11 +58,11 @@ class Thresholds:
       cause alone. Of 193 names that had 90 % and more (exams, study; two draws of seeds) 173 were
       right: 97 % above half a nat a sample, 81 % below; 96 % alone, 84 % of several. Odds as
       (n/E)^(1/2) and as the number of causes raise the likelihood of that by 8 and 3 nats.
-    * `credible`: probability that the set of effects that cannot be told apart holds the cause.
+    * `credible`: probability that the set of effects that cannot be separated holds the cause.
     * `clearly`: tempered odds [nats] below which another correction, or another effect in a
       cause's place, is as likely as the best one: 20 to 1.
     * `enough`: share of the held-out excess that causes must remove to be named where structure
-      remains. Of the names that were told although it did (study, sets of causes, exam) all 16
+      remains. Of the names that were stated although it did (study, sets of causes, exam) all 16
       that removed less than 66 % were wrong, right ones removed 82 % and more. An unnamed
       correction of a cause's kind counts by this share of its evidence: of some 300 names four had
       less, two of them wrong.
@@ -108,24 +108,24 @@ STEPS = (
     "one clock",  # readings stay on a clock of their own, whatever the data say
     "remainder",  # the noise's colour is that of the residual, not of what nothing explains
     "finite steps",  # effects whose derivative vanishes at their null are not sought by a step
-    "fits afresh",  # no fits from an ordinary base beside those from the fitted one
+    "fits afresh",  # no fits from an ordinary base besides those from the fitted one
     "other parents",  # a set is fitted from one of its parents only
-    "begun again",  # a cause that comes near the end of its range does not begin once more
+    "begun again",  # a cause that comes near the end of its range is not fitted once more
     "base again",  # the base is not fitted again from where a cause has led
-    "resonances",  # no resonances that the base has missed are tried
+    "resonances",  # no resonances that the base lacks are tried
     "several modes",  # no series of modes is fitted where one leaves structure
-    "several at once",  # causes are found one by one only
-    "exchange",  # causes are not exchanged beside the later ones
+    "several at once",  # causes are added one by one only
+    "exchange",  # causes are not exchanged with the later ones
     "all afresh",  # effects far behind in the screening are never fitted
     "rejected",  # no neighbours of what held-out data reject are fitted
-    "held out",  # held-out data are not asked
+    "held out",  # held-out data are not used
     "between samples",  # the voltage between two samples is a straight line, whatever the data say
     "noise",  # noise of another colour may explain as much as a cause
     "form",  # a further cause may be smaller than the first one's form is known
 )
 
 
-#: Work (`timings.Work`) of a search beyond which nothing more is begun: some 50 s of processor
+#: Work (`timings.Work`) of a search beyond which nothing more is started: some 50 s of processor
 #: time. The third longest of the golden cases takes 5.9e8.
 BUDGET = 700_000_000
 
@@ -135,7 +135,7 @@ class Method:
     """The method, `without` some of its `STEPS`, with its deciding constants.
 
     `budget` is the work of a search (steps of simulations times one more than the derivatives
-    beside them) beyond which it begins nothing more.
+    beside them) beyond which it starts nothing more.
     """
 
     without: frozenset[str] = frozenset()
@@ -143,16 +143,16 @@ class Method:
     budget: float = BUDGET
 
 
-#: Why a hypothesis is told of.
+#: Why a hypothesis is reported.
 State = Literal["fitted", "finished", "visited", "best"]
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A hypothesis of a search at the moment that it is told of.
+    """A hypothesis of a search at the moment that it is reported.
 
     `state` says why: it was "fitted", its fit went on to its end ("finished"), its neighbours are
-    fitted next ("visited"), or it is the answer ("best"). `causes` stand beside the base in the
+    fitted next ("visited"), or it is the answer ("best"). `causes` are added to the base in the
     order in which they were added, so that all but the last are the parent's. `evidence` is ln of
     the Bayes factor over the first base fit, `score` that less the price of the causes. `rms_m`
     and `holdout_rms_m` [m] are the errors in fitted and in held-out samples, `base_rms_m` and
@@ -175,7 +175,7 @@ def same_curves(
     """Return groups of effects that bend the same curve, where the records show no resonance.
 
     They show one if a `fit` of them needed a mass and a record is fast enough to see it ring. A
-    second sensor of the displacement tells them apart.
+    second sensor of the displacement separates them.
     """
     if any(f.column in _TELL_BENDS for f in fit.further):
         return ()

@@ -1,8 +1,8 @@
-"""What is said of a stack more than of any model: blind spots, rivals, the next record.
+"""What a diagnosis states of a stack more than of any model: blind spots, rivals, the next record.
 
 What belongs to the sensor or the environment stays out of an exported plant. Where the records
 cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
-So there are two models, and the difference of their plants' displacements is told.
+So there are two models, and the difference of their plants' displacements is reported.
 """
 
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ def next_experiment(
     *,
     doubted: bool,
 ) -> NextExperiment:
-    """Return what to do next; `groups` are effects that only a resonance tells apart."""
+    """Return what to do next; `groups` are effects that only a resonance separates."""
     if verdict == "not_driven":
         return NextExperiment(None, (), (note("correct_columns"),))
     if doubted:
@@ -136,7 +136,7 @@ def alternatives(
     Of several such effects the likeliest that can be fitted and simulated.
     """
     effects, experiments = {e.name: e for e in task.table}, task.experiments
-    items = []
+    models = []
     for step in named:
         for name in sorted(
             indistinguishable(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
@@ -151,11 +151,11 @@ def alternatives(
             except PsaError:
                 continue
             model = diagnosed_model(fitted.fit, experiments, fitted.predicted, stiffness_given)
-            items.append(
+            models.append(
                 Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
             )
             break
-    return tuple(items)
+    return tuple(models)
 
 
 def _fitted(step: Step, name: str) -> Hypothesis | None:
@@ -193,9 +193,9 @@ def diagnosed_model(
     stiffness_given: bool,
     spent: held_out.StackBudget | None = None,
 ) -> Model:
-    """Return a model of a diagnosis with what stands behind it; `spent` is its error's budget."""
+    """Return a model of a diagnosis with its evidence; `spent` is its error's budget."""
     result = determinacy(fit, experiments)
-    output = replace(
+    evidence = replace(
         evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
         budget=None
@@ -210,7 +210,7 @@ def diagnosed_model(
         ),
     )
     records = [e.record for e in experiments]
-    return with_provenance(fit.model, result, records, stiffness_given, evidence=output)
+    return with_provenance(fit.model, result, records, stiffness_given, evidence=evidence)
 
 
 def _held_out(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> HeldOut | None:
@@ -240,7 +240,7 @@ def _share(s: held_out.Share) -> ErrorShare:
 
 
 class StackJudge(Judge):
-    """The judge of a stack: repeats tell its noise, its one output is its displacement."""
+    """The judge of a stack: repeats show its noise, its one output is its displacement."""
 
     def __init__(
         self, steps: Sequence[Step], task: Task, *, scale_given: bool, driven: bool = True
@@ -288,7 +288,7 @@ class StackJudge(Judge):
         return held_out.stack_budget(self.budget, self.experiments, *both, self.floor)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
-        """Return the corrections beside a hypothesis, by columns at the stack's ports."""
+        """Return the corrections of a hypothesis, by columns at the stack's ports."""
         return corrections(of.fit, self.experiments, self.last.screening.colour)
 
     def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
@@ -349,7 +349,7 @@ class StackJudge(Judge):
 
 
 def patched_model(d: Diagnosis) -> Model:
-    """Return the extended model with the unnamed correction fitted beside it, all values free.
+    """Return the extended model with the unnamed correction fitted with it, all values free.
 
     Raises InputError where a diagnosis has none, or one that no component stands for;
     SimulationError where it cannot be simulated.

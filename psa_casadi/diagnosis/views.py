@@ -203,7 +203,7 @@ def _explained(count: FloatArray, total: FloatArray, noise: float) -> tuple[floa
 _TURN, _NOISES = 1e-4, 8.0
 #: The noise of a rate is brought below this share of the mean rate.
 _QUIET = 0.05
-#: Frequencies are told apart from this step of their decimal logarithm on.
+#: Frequencies are separated from this step of their decimal logarithm on.
 _STEP = 0.02
 
 

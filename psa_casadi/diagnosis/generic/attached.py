@@ -34,11 +34,11 @@ _DOES: dict[str, Kind] = {
     "change": "changing gain", "gain": "gain", "backlash": "hysteresis",
 }  # fmt: skip
 #: Returns a parameter or a state of an effect by its short name.
-Own = Callable[[str], Expression]
+SymbolOf = Callable[[str], Expression]
 #: The derivatives of an effect's own states, by short name, and its term.
 Terms = tuple[dict[str, Expression], Expression]
 #: The equations of an effect: (symbols, its own by short name) -> term, or both.
-Law = Callable[[Symbols, Own], Terms | Expression]
+Law = Callable[[Symbols, SymbolOf], Terms | Expression]
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ def of_ones_own(model: Model, component: Component) -> Attached:
             f" add to one of {', '.join(ports)}, and name a parameter as its gain."
         )
     reads = tuple(p for name, p in ports.items() if name in symbols.made and p not in added)
-    output = replace(component, description=f"{added[0].words}: {component.description}")
-    return Attached(output, added[0], (*added[1:], *reads))
+    described = replace(component, description=f"{added[0].words}: {component.description}")
+    return Attached(described, added[0], (*added[1:], *reads))
 
 
 def extended(base: Model, effects: Iterable[Attached]) -> Model:

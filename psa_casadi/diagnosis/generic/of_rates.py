@@ -12,7 +12,7 @@ from psa_casadi.diagnosis.generic.attached import (
     LARGEST,
     ORDINARY,
     Attached,
-    Own,
+    SymbolOf,
     Terms,
     at_port,
     rounded,
@@ -72,15 +72,15 @@ def sum_effects(model: Model, port: ports.Port, sizes: Sizes) -> tuple[Attached,
     """
     at = _Sum(model, port, sizes)
     rate = [port.variable] if port.kind == "rate" else []
-    items = [n for n in ports.seen_by(model, port) if n not in model.input_names]
-    ways = [n for n in items if n not in rate and not _way(model, n)[1]]
-    losing = rate or [n for n in items if n not in ways]
-    # a hysteresis works along coordinates, else along all that is seen
+    variables = [n for n in ports.seen_by(model, port) if n not in model.input_names]
+    ways = [n for n in variables if n not in rate and not _way(model, n)[1]]
+    losing = rate or [n for n in variables if n not in ways]
+    # a hysteresis works along coordinates, else along all variables
     return (
         _constant(at),
         *(make(at, n) for n in losing for make in (_loss, _friction, _drag)),
-        *(make(at, n) for n in items for make in (_curve, _stop)),
-        *(_hysteresis(at, n) for n in ways or items),
+        *(make(at, n) for n in variables for make in (_curve, _stop)),
+        *(_hysteresis(at, n) for n in ways or variables),
     )
 
 
@@ -103,7 +103,7 @@ def _name(kind: str, port: ports.Port, q: str) -> str:
 
 def _constant(at: _Sum) -> Attached:
     return at_port(
-        at.port, f"constant_in_{at.port.variable}", lambda s, item: item("size"),
+        at.port, f"constant_in_{at.port.variable}", lambda s, symbol: symbol("size"),
         words=(
             "a constant is missing",
             "weight, leak, offset of an input",
@@ -117,7 +117,7 @@ def _constant(at: _Sum) -> Attached:
 def _loss(at: _Sum, v: str) -> Attached:
     return at_port(
         at.port, _name("loss", at.port, v),
-        lambda s, item: -item("size") * getattr(s, v) / item("range"),
+        lambda s, symbol: -symbol("size") * getattr(s, v) / symbol("range"),
         words=(
             f"it loses in proportion to {v}",
             "viscous damping, leak, cooling",
@@ -131,9 +131,9 @@ def _loss(at: _Sum, v: str) -> Attached:
 def _friction(at: _Sum, v: str) -> Attached:
     size = rounded(at.sizes.signals[v])
 
-    def law(s: Symbols, item: Own) -> Expression:
+    def law(s: Symbols, symbol: SymbolOf) -> Expression:
         state = getattr(s, v)
-        return -item("size") * state / ca.sqrt(state**2 + item("width") ** 2)
+        return -symbol("size") * state / ca.sqrt(state**2 + symbol("width") ** 2)
 
     return at_port(
         at.port, _name("friction", at.port, v), law,
@@ -155,9 +155,9 @@ def _friction(at: _Sum, v: str) -> Attached:
 
 
 def _drag(at: _Sum, v: str) -> Attached:
-    def law(s: Symbols, item: Own) -> Expression:
-        part = getattr(s, v) / item("range")
-        return -item("size") * part * smooth_magnitude(part, _STILL)
+    def law(s: Symbols, symbol: SymbolOf) -> Expression:
+        part = getattr(s, v) / symbol("range")
+        return -symbol("size") * part * smooth_magnitude(part, _STILL)
 
     return at_port(
         at.port, _name("drag", at.port, v), law,
@@ -174,7 +174,7 @@ def _drag(at: _Sum, v: str) -> Attached:
 def _curve(at: _Sum, x: str) -> Attached:
     return at_port(
         at.port, f"curve_of_{x}_in_{at.port.variable}",
-        lambda s, item: item("size") * bent(getattr(s, x) / item("range"), item("angle")),
+        lambda s, symbol: symbol("size") * bent(getattr(s, x) / symbol("range"), symbol("angle")),
         words=(
             f"it depends on {x} along a curve",
             "hardening or softening spring; first two terms beyond the straight line",
@@ -188,9 +188,9 @@ def _curve(at: _Sum, x: str) -> Attached:
 def _stop(at: _Sum, x: str) -> Attached:
     force, size = at.largest, rounded(at.sizes.signals[x])
 
-    def law(s: Symbols, item: Own) -> Expression:
-        excess = beyond(getattr(s, x), item("level"), _CORNER * item("range"))
-        return -item("size") * excess / item("range")
+    def law(s: Symbols, symbol: SymbolOf) -> Expression:
+        excess = beyond(getattr(s, x), symbol("level"), _CORNER * symbol("range"))
+        return -symbol("size") * excess / symbol("range")
 
     return at_port(
         at.port, f"stop_of_{x}_in_{at.port.variable}", law,
@@ -219,13 +219,13 @@ def _hysteresis(at: _Sum, x: str) -> Attached:
     """
     (parts, reads), force = _way(at.model, x), at.largest
 
-    def law(s: Symbols, item: Own) -> Terms:
+    def law(s: Symbols, symbol: SymbolOf) -> Terms:
         rate = sum(factor * getattr(s, speed) for speed, factor in parts)
-        w, z = rate / item("range"), item("state")
-        size = smooth_magnitude(w, _STILL * item("rate") / item("range"))
-        power, signed = magnitude_power(z, item("n")), signed_power(z, item("n"))
-        der = w * (1 - item("bend") * power) - item("loss") * size * signed
-        return {"state": der}, -item("size") * z
+        w, z = rate / symbol("range"), symbol("state")
+        size = smooth_magnitude(w, _STILL * symbol("rate") / symbol("range"))
+        power, signed = magnitude_power(z, symbol("n")), signed_power(z, symbol("n"))
+        der = w * (1 - symbol("bend") * power) - symbol("loss") * size * signed
+        return {"state": der}, -symbol("size") * z
 
     return at_port(
         at.port, f"hysteresis_of_{x}_in_{at.port.variable}", law,
@@ -269,10 +269,10 @@ def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
 def _with(port: ports.Port, x: str, unit: str, size: float) -> Attached:
     p = port.variable if port.kind == "parameter" else ports.true_sum(port.variable)
 
-    def law(s: Symbols, item: Own) -> Expression:
-        part = getattr(s, x) / item("range")
-        curve = ca.cos(item("angle")) * part + ca.sin(item("angle")) * part**2
-        return item("size") * getattr(s, p) * curve
+    def law(s: Symbols, symbol: SymbolOf) -> Expression:
+        part = getattr(s, x) / symbol("range")
+        curve = ca.cos(symbol("angle")) * part + ca.sin(symbol("angle")) * part**2
+        return symbol("size") * getattr(s, p) * curve
 
     return at_port(
         port, f"change_of_{port.variable}_with_{x}", law,

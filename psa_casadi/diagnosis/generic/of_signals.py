@@ -16,7 +16,7 @@ from psa_casadi.diagnosis.generic.attached import (
     LARGEST,
     ORDINARY,
     Attached,
-    Own,
+    SymbolOf,
     Terms,
     at_port,
     rounded,
@@ -44,7 +44,7 @@ ANGLE = Parameter(
 #: What a signal belongs to.
 _PLACE = {"input": "drive", "output": "sensor", "intermediate": "plant"}
 #: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> term, or both.
-_Law = Callable[[Symbols, Expression, Own], Terms | Expression]
+_Law = Callable[[Symbols, Expression, SymbolOf], Terms | Expression]
 
 
 def signal_effects(port: Port, sizes: Sizes, *, imported: bool = False) -> tuple[Attached, ...]:
@@ -68,7 +68,7 @@ def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
     return at_port(
         port,
         f"{kind}_of_{port.variable}",
-        lambda s, item: law(s, getattr(s, signal), item),
+        lambda s, symbol: law(s, getattr(s, signal), symbol),
         belongs_to=_PLACE[port.kind],
         signal=signal,
         **more,
@@ -76,9 +76,9 @@ def _made(port: Port, kind: str, law: _Law, **more: Any) -> Attached:
 
 
 def _lag(port: Port, sizes: Sizes) -> Attached:
-    def law(s: Symbols, q: Expression, item: Own) -> Terms:
-        time, behind = item("time") + item("floor"), item("state") - q
-        return {"state": -behind / time}, item("time") / time * behind
+    def law(s: Symbols, q: Expression, symbol: SymbolOf) -> Terms:
+        time, behind = symbol("time") + symbol("floor"), symbol("state") - q
+        return {"state": -behind / time}, symbol("time") / time * behind
 
     return _made(
         port, "lag", law,
@@ -96,10 +96,10 @@ def _lag(port: Port, sizes: Sizes) -> Attached:
 
 
 def _delay(port: Port, sizes: Sizes) -> Attached:
-    def law(s: Symbols, q: Expression, item: Own) -> Terms:
-        half, floor = item("time") / 2, item("floor")
-        a1, b1, first = pade_section(half, floor, q, item("a1"), item("b1"))
-        a2, b2, second = pade_section(half, floor, first, item("a2"), item("b2"))
+    def law(s: Symbols, q: Expression, symbol: SymbolOf) -> Terms:
+        half, floor = symbol("time") / 2, symbol("floor")
+        a1, b1, first = pade_section(half, floor, q, symbol("a1"), symbol("b1"))
+        a2, b2, second = pade_section(half, floor, first, symbol("a2"), symbol("b2"))
         return {"a1": a1, "b1": b1, "a2": a2, "b2": b2}, second - q
 
     size = _size(port, sizes)
@@ -123,7 +123,7 @@ def _delay(port: Port, sizes: Sizes) -> Attached:
 
 def _gain(port: Port, sizes: Sizes) -> Attached:
     return _made(
-        port, "gain", lambda s, q, item: item("size") * q,
+        port, "gain", lambda s, q, symbol: symbol("size") * q,
         words=(
             "its gain is another one",
             "amplifier, scale of a sensor, a wrong unit",
@@ -139,10 +139,10 @@ def _gain(port: Port, sizes: Sizes) -> Attached:
 def _backlash(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
 
-    def law(s: Symbols, q: Expression, item: Own) -> Terms:
-        behind = q - item("state")
-        pushed = beyond(behind, item("width"), item("corner"))
-        return {"state": pushed / item("floor")}, -item("gain") * behind
+    def law(s: Symbols, q: Expression, symbol: SymbolOf) -> Terms:
+        behind = q - symbol("state")
+        pushed = beyond(behind, symbol("width"), symbol("corner"))
+        return {"state": pushed / symbol("floor")}, -symbol("gain") * behind
 
     words = "width over which the corner is rounded, a scale only"
     return _made(
@@ -171,7 +171,8 @@ def _backlash(port: Port, sizes: Sizes) -> Attached:
 def _bend(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
     return _made(
-        port, "bend", lambda s, q, item: item("size") * bent(q / item("range"), item("angle")),
+        port, "bend",
+        lambda s, q, symbol: symbol("size") * bent(q / symbol("range"), symbol("angle")),
         words=(
             "its gain depends on its level",
             "first two terms of a static curve beyond the straight line",
@@ -189,7 +190,7 @@ def _saturation(port: Port, sizes: Sizes) -> Attached:
     size = _size(port, sizes)
     return _made(
         port, "saturation",
-        lambda s, q, item: -item("gain") * beyond(q, item("level"), item("corner")),
+        lambda s, q, symbol: -symbol("gain") * beyond(q, symbol("level"), symbol("corner")),
         gain="gain",
         words=(
             "it goes no further than a level, to either side",
@@ -211,7 +212,7 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
     lost = "share of the small values that is lost"
     return _made(
         port, "dead_zone",
-        lambda s, q, item: -item("gain") * (q - beyond(q, item("level"), item("corner"))),
+        lambda s, q, symbol: -symbol("gain") * (q - beyond(q, symbol("level"), symbol("corner"))),
         gain="gain",
         words=(
             "small values of it do nothing",
@@ -231,7 +232,7 @@ def _dead_zone(port: Port, sizes: Sizes) -> Attached:
 def _zero(port: Port, sizes: Sizes) -> Attached:
     shift = replace(size_of(port.unit, _size(port, sizes), "shift of the zero"), name="shift")
     return _made(
-        port, "zero", lambda s, q, item: item("shift"),
+        port, "zero", lambda s, q, symbol: symbol("shift"),
         gain="shift",
         words=(
             "its zero is shifted",
@@ -245,7 +246,7 @@ def _zero(port: Port, sizes: Sizes) -> Attached:
 
 def _drift(port: Port, sizes: Sizes) -> Attached:
     return _made(
-        port, "drift", lambda s, q, item: item("size") * s.time / item("duration"),
+        port, "drift", lambda s, q, symbol: symbol("size") * s.time / symbol("duration"),
         words=(
             "its zero drifts with time",
             "sensor that warms up",

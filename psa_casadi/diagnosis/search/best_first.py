@@ -1,8 +1,8 @@
 """The search for causes: best first over sets of causes, one score for all of them.
 
-Every set of causes has one hypothesis, the best fit of it that was found. The best hypothesis is
+Every set of causes has one hypothesis, the best fit of it so far. The best hypothesis is
 looked at: is anything left in its residual? Then its neighbours are fitted: the base with
-resonances that it has missed; with one more cause; with several at once; with one less (which fits
+resonances that it lacks; with one more cause; with several at once; with one less (which fits
 the base again from where the cause has led); with one cause in another's place. That goes on while
 one of them is better; where much is left, from another base and with all effects.
 """
@@ -24,9 +24,9 @@ from psa_casadi.simulation.timings import Work, counted, stage
 
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
 _EXPANSIONS, _VISITS = 5, 24
-#: Where a neighbour's residual is within this factor of the noise, none needs fits afresh; else of
-#: a first and a further cause so many get some. The noise is told too low by what was projected out
-#: of it: 1.7 % where 132 directions were taken out of 3,900 samples.
+#: Where a neighbour's residual is within this factor of the noise, none needs fits from default
+#: values; else of a first and a further cause so many get some. The noise is estimated too low by
+#: what was projected out of it: 1.7 % where 132 directions were taken out of 3,900 samples.
 _SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
 #: Causes that could not be named with this probability are small.
 _SURELY = 0.9
@@ -40,7 +40,7 @@ _PACE = 2
 def best_first(base: Fit, task: Task, before: SearchState | None = None) -> SearchState:
     """Return what a search from a base fit finds. Raises SimulationError where that one fails.
 
-    Where its work goes beyond the method's budget it begins nothing more, and says what it left.
+    Where its work goes beyond the method's budget it starts nothing more, and reports what it left.
     A search `before` of the same base with fewer effects has fitted hypotheses that are used again.
     """
     with counted() as work:
@@ -99,7 +99,7 @@ class _Search:
             self.known.remarks = (note("budget", work=float(self.work.done), left=left),)
 
     def does(self, step: str) -> bool:
-        """Whether a step belongs to the method, and may be begun; the budget may be spent."""
+        """Whether a step belongs to the method, and may start; the budget may be spent."""
         if step in self.task.method.without:
             return False
         if self.work.done <= self.task.method.budget:
@@ -133,7 +133,7 @@ class _Search:
         return None
 
     def is_small(self, h: Hypothesis) -> bool:
-        """Whether causes are so small beside the noise that others may be as likely."""
+        """Whether causes are so small relative to the noise that others may be as likely."""
         shown = CauseEvidence(self.known.scale.evidence(h), len(h.fit.residuals))
         return bool(h.causes) and shown.listed_probability(self.task.limits) < _SURELY
 
@@ -217,7 +217,7 @@ class _Search:
 
     @stage("fits of candidates")
     def add_causes(self, h: Hypothesis, view: View) -> None:
-        """Fit with one more cause, from the hypothesis, afresh, and the leading ones to the end."""
+        """Fit with one more cause, from here and from default values; end the leading fits."""
         leading = [s for s in view.leading() if self.known.different(s[0].direction.effect, h)]
         leading = [s for s in leading if (h.fit, s[0].direction.effect.name) not in self.tried]
         names = [scores[0].direction.effect.name for scores in leading]
@@ -242,7 +242,7 @@ class _Search:
 
     @stage("fits of candidates")
     def several_modes(self, h: Hypothesis, view: View) -> bool:
-        """Fit a series of modes beside the base or in a single one's place; whether it is best.
+        """Fit a series of modes added to the base or in a single one's place; whether it is best.
 
         Where fast records show several, or where one leaves structure.
         """
@@ -320,10 +320,10 @@ class _Search:
         self.known.note(hypothesis(before.causes, fit, task.experiments, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
-        """Fit with resonances that the base has missed; whether that explains more.
+        """Fit with resonances that the base lacks; whether that explains more.
 
         Those of fast records first. One near or above the band is tried where its ringing explains
-        as much as an effect would; it bends itself to a cause that is not found yet, so that
+        as much as an effect would; it bends itself to a cause that is not known yet, so that
         without a cause it counts only where nothing is left to explain.
         """
         task, experiments = self.task, self.task.experiments
@@ -339,9 +339,9 @@ class _Search:
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
         fit = base_fit.from_band(h.fit, experiments, task.progress)
-        item = hypothesis(h.causes, fit, experiments, final=True)
-        if item is not None and (h.causes or not examine(item, task, self.known.trials).leaves):
-            self.known.note(item)
+        other = hypothesis(h.causes, fit, experiments, final=True)
+        if other is not None and (h.causes or not examine(other, task, self.known.trials).leaves):
+            self.known.note(other)
         return self.known.hypotheses.get(h.names) is not h
 
     def seen_in_records(self) -> bool:

@@ -1,4 +1,4 @@
-"""Fits of a model with one cause more, one less, or another: from its parent and afresh."""
+"""Fits of a model with one cause more, one less, or another: from its parent and defaults."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -144,9 +144,9 @@ def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
 
 
-#: Evaluations of quick fits beside other causes, of sets afresh, and of one effect afresh that goes
-#: on; of these the best so many of one effect, and of any; there the gain begins at so many
-#: ordinary sizes.
+#: Evaluations of quick fits beside other causes, of sets from default values, and of one effect
+#: that goes on; of these the best so many of one effect, and of any; there the gain begins at so
+#: many ordinary sizes.
 _BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
 #: Shares of their gains with which the causes begin that are left without another.
@@ -179,8 +179,8 @@ def with_causes(before: Hypothesis, start: Together, goal: float = np.inf) -> Hy
         for d, gain in zip(start.directions, start.gains, strict=True)
     ]
     memory = tuple(
-        {k: v for d in start.directions for k, v in d.memory[r].items()} | item
-        for r, item in enumerate(before.fit.starts())
+        {k: v for d in start.directions for k, v in d.memory[r].items()} | state
+        for r, state in enumerate(before.fit.starts())
     )
     quick = fit_with_all(before.fit, before.experiments, added, memory, {}, _SET_AFRESH, goal)
     return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
@@ -223,7 +223,7 @@ def fit_from_default(
 
 
 def fit_any_from_default(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
-    """Fit the effects of the scores afresh; return the best of all."""
+    """Fit the effects of the scores from default values; return the best of all."""
     results = side_by_side(
         lambda d: _from_ordinary(before.fit, before.experiments, d.effect, d.values),
         [score.direction for score in scores],
@@ -240,20 +240,20 @@ def in_place(
     whole: Hypothesis,
     less: Hypothesis,
     reached: Fit,
-    item: Fit,
+    alone: Fit,
     effect: Component,
     goal: float = np.inf,
 ) -> Hypothesis | None:
-    """Fit an effect beside the causes of `less`, where the `whole` has another one.
+    """Fit an effect with the causes of `less`, where the `whole` has another one.
 
-    The effect begins with its values in its `item` fit, the rest with those that were `reached`;
+    The effect begins with its values in its `alone` fit, the rest with those that were `reached`;
     what `reached` does not have stays as in `less`.
     """
-    values = item.model.values
+    values = alone.model.values
     start = (
         {p.name: values[p.name] for p in effect.parameters if p.name != effect.gain},
         values[effect.gain or ""],
-        tuple({**s, **r} for s, r in zip(item.starts(), reached.starts(), strict=True)),
+        tuple({**s, **r} for s, r in zip(alone.starts(), reached.starts(), strict=True)),
     )
     return exchanged(whole, less, effect, start, reached, goal)
 

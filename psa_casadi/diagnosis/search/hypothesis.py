@@ -5,11 +5,11 @@
     ln L  = m ln(E_0 / E)
 
 Laplace's approximation of the Bayes factor over the plain base fit, of k unknowns. S and S_0 are
-sums of squares of n whitened residuals, the noise level being the data's own; H is the information
-on the unknowns that the base has not, those it has projected out, and P their prior standard
-deviations. An unknown that the data do not tell costs nothing, a sharp one costs what its prior
-range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). L is what the fitted
-samples predict of the held-out ones: E are the rms of their errors, m their number over the
+sums of squares of n whitened residuals, the noise level being estimated from the data; H is the
+information on the unknowns that the base has not, those it has projected out, and P their prior
+standard deviations. An unknown that the data leave open costs nothing, a sharp one costs what its
+prior range is wider than its interval (MacKay, Neural Computation 4 (1992), 415). L is what the
+fitted samples predict of the held-out ones: E are the rms of their errors, m their number over the
 inflation by the noise's colour. The evidence of all samples is the product of the two. Records that
 are held out whole judge alone: of these the score has no L. The price is the prior of a cause.
 """
@@ -49,9 +49,9 @@ from psa_casadi.units import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model with some causes beside the base, fitted to the records of `experiments`.
+    """A model with some causes added to the base, fitted to the records of `experiments`.
 
-    `causes` are in the order in which the search found them; `predictions` (n, channels) are the
+    `causes` are in the order of the search; `predictions` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
     held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
     `colours` are those that every channel's residual has by itself; `final` says that the fit went
@@ -147,23 +147,23 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        displayed = tuple(fit.predicted_channels(experiments))
+        predictions = tuple(fit.predicted_channels(experiments))
     except PsaError:
         return None
     rows, colours = [], []
     for k, f in enumerate(fit.channels):
         held, train, every, rests = [], [], [], []
-        for e, y in zip(experiments, displayed, strict=True):
+        for e, y in zip(experiments, predictions, strict=True):
             left = e.errors(f.number, y[:, k])
             held.append(left[e.at(f.number, e.held_out)])
             train.append(left[e.at(f.number)])
             every.append(left[np.isfinite(left)])
             rests.append(left)
-        item = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
-        rows.append((item[0] or (f.rms if k else 0.0), *item[1:]))
+        errors = tuple(rms(np.concatenate(parts)) for parts in (held, train, every))
+        rows.append((errors[0] or (f.rms if k else 0.0), *errors[1:]))
         fitted = [e.at(f.number) for e in experiments]
         judged = [e.at(f.number, e.held_out) for e in experiments]
-        rates = [np.gradient(y[:, k]) for y in displayed]
+        rates = [np.gradient(y[:, k]) for y in predictions]
         # the parameters of several channels do not follow the colour of one of them
         free = slice(0 if fit.further else None)
         follow = f.jacobian[:, free], fit.unknowns.prior[free]
@@ -173,7 +173,7 @@ def hypothesis(
         tuple(causes),
         fit,
         experiments,
-        displayed,
+        predictions,
         held_rms,
         train_rms,
         whole,
@@ -261,7 +261,7 @@ _STARTS = 2
 class View:
     """What the residual of a hypothesis shows.
 
-    `of` is the hypothesis as it was seen, `trials` the directions of further effects there,
+    `of` is the hypothesis as it was tested, `trials` the directions of further effects there,
     `screening` their scores with the colour of the noise, `test` the omnibus test; `pack` knows the
     kind of device.
     """
@@ -282,7 +282,7 @@ class View:
         return estimated(self.of.fit, self.screening)
 
     def leading(self) -> list[list[Score]]:
-        """Return the best starts of the effects worth a fit, the best effect first."""
+        """Return the best starts of the effects that are to be fitted, the best effect first."""
         return [self.starts_of(name) for name in self.screening.leading()]
 
     def starts_of(self, name: str) -> list[Score]:
@@ -290,7 +290,7 @@ class View:
 
         Of an effect that has two forms, between which no fit moves, each form gets a start; a
         further start differs from the best one in as many trial values as it can. One that is
-        looked for with both signs of its gain begins at each of these steps, too.
+        looked for with both signs of its gain starts at each of these steps, too.
         """
         scores = [s for s in self.screening.scores if s.direction.effect.name == name]
         near = [s for s in scores if s.decrease >= 0.3 * scores[0].decrease]
@@ -322,9 +322,9 @@ class View:
 
     @property
     def shows(self) -> bool:
-        """Whether a direction is above the threshold and would remove what can be told.
+        """Whether a direction is above the threshold and promises more than the detection limit.
 
-        Beside a cause the test must alarm too: what it leaves of its own form shows in directions.
+        With a cause the test must alarm too: what it leaves of its own form shows in directions.
         """
         fit, asked = self.of.fit, self.test.alarm or not self.of.causes
         significant = self.decrease >= self.screening.threshold
@@ -341,8 +341,8 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     """Screen the effects that a hypothesis does not hold yet, and test its residual.
 
     Directions that are `known` from the base are used again: what an effect adds hardly changes
-    with another effect beside it, and a full fit judges. Without causes the test has the colour of
-    the residual itself, which slow noise of any kind may have; beside causes that of the screening,
+    with another effect added, and a full fit judges. Without causes the test has the colour of
+    the residual itself, which slow noise of any kind may have; with causes that of the screening,
     and it asks whether the residual is as large everywhere.
     """
     task.progress("screening effects")
@@ -371,7 +371,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
 def _asked(
     fit: Fit, trials: Sequence[Direction], colour: Colour, test: Omnibus, limits: Thresholds
 ) -> Omnibus:
-    """Return the test with what an effect would lower beside noise of that colour, if it alarms.
+    """Return the test with what an effect would lower in noise of that colour, if it alarms.
 
     The best direction of effects with m weights removes chi^2 of m noise variances, with
     Bonferroni's correction for the number of directions.
@@ -382,8 +382,8 @@ def _asked(
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
     share = best.decrease * colour.level**2 / float(np.sum(whitened_residuals(fit, colour) ** 2))
     size = float(np.sqrt(min(share, 1.0))) * fit.rms
-    requested = replace(test, p_value=p, structure="effect", size=size)
-    return requested if requested.alarm else test
+    of_effect = replace(test, p_value=p, structure="effect", size=size)
+    return of_effect if of_effect.alarm else test
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
@@ -410,25 +410,25 @@ def held_out_confirms(of: Hypothesis, before: Hypothesis, scale: Scale) -> bool:
     if not any(scale.held):
         return True
     promise = 0.0
-    for k, (f, item) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
+    for k, (f, c) in enumerate(zip(of.fit.channels, scale.colour.each, strict=True)):
         rows = zip(of.experiments, of.predictions, before.predictions, strict=True)
         change = np.concatenate(
             [(new - old)[e.at(f.number, e.held_out), k] / e.share(f.number) for e, new, old in rows]
         )
         if change.size:
             after = max(float(np.hypot(of.held[k], f.straight)), 1e-300)
-            samples = change.size / item.inflation
+            samples = change.size / c.inflation
             promise += 0.5 * samples * float(np.mean(change**2)) / after**2
     gained, score = scale.held_out(of, before), scale.of_fitted(of) - scale.of_fitted(before)
     return confirmed(gained, promise, score, scale.limits)
 
 
 def confirmed(gained: float, promise: float, score: float, limits: Thresholds = LIMITS) -> bool:
-    """Whether a gain of the held-out log-likelihood is enough, beside that of the score [nats].
+    """Whether a gain of the held-out log-likelihood is enough, with that of the score [nats].
 
-    A promised gain p is found give or take sqrt(2 p). Found must be `held_out`, or, where these
-    samples can hardly show the cause, two such errors less than what is promised; and so much must
-    the fitted samples' score and what is found be together.
+    A promised gain p is observed with an error of sqrt(2 p). The observed gain must be `held_out`,
+    or, where these samples can hardly show the cause, two such errors less than what is promised;
+    and so much must the fitted samples' score and the observed gain be together.
     """
     least = min(limits.held_out, promise - 2.0 * float(np.sqrt(2.0 * promise)))
     return bool(gained > least and score + gained > limits.held_out)

@@ -1,4 +1,4 @@
-"""Moves of the search beside one effect more: modes, exchanges, several at once, rivals."""
+"""Moves of the search for more than one effect: modes, exchanges, several at once, rivals."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -82,7 +82,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
 def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """Fit one mode in the place of a series, from each of those, and the best to the end.
 
-    The series is the last cause; `less` is the hypothesis without it. The base begins where the
+    The series is the last cause; `less` is the hypothesis without it. The base starts where the
     series has led it: modes may stand for what the base without them had bent itself to.
     """
     fit = series.fit
@@ -107,7 +107,7 @@ def _even(time: FloatArray) -> bool:
 
 
 def _moving(e: Experiment, most: int) -> slice:
-    """Return so many samples at most, from where the voltage begins to move."""
+    """Return so many samples at most, from where the voltage starts to move."""
     v = e.record.voltage[: e.stop]
     moves = np.flatnonzero(v != v[0])
     begin = max(0, int(moves[0]) - 1) if moves.size else 0
@@ -137,7 +137,7 @@ _MOST = 3
 
 @stage("causes judged again")
 def exchange(h: Hypothesis, known: SearchState) -> None:
-    """Fit in each cause's place what the screening beside all others finds near it."""
+    """Fit in each cause's place what the screening with all others finds near it."""
     for cause in h.causes:
         less = known.hypotheses.get(h.names - {cause.name})
         if less is None:
@@ -155,7 +155,7 @@ def exchange(h: Hypothesis, known: SearchState) -> None:
 
 
 def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Score]]:
-    """Return the starts of effects that promise nearly what `h` gains beside the causes of `less`.
+    """Return the starts of effects that promise nearly what `h` gains with the causes of `less`.
 
     They are not among the causes, and bend no curve that one of them bends.
     """
@@ -174,7 +174,7 @@ def _near(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[list[Scor
 def _put_in_place(
     h: Hypothesis, less: Hypothesis, starts: Sequence[Score], known: SearchState
 ) -> None:
-    """Fit an effect beside the causes of `less`, from there and from where `h` has led the base.
+    """Fit an effect with the causes of `less`, from there and from where `h` has led the base.
 
     To the end where that comes near.
     """
@@ -202,13 +202,13 @@ def _copies(h: Hypothesis, less: Hypothesis, known: SearchState) -> list[Copy]:
     table = [e for e in known.task.table if e.name not in h.names]
     trials = [d for d in known.trials if d.effect in table and known.different(d.effect, less)]
     power, result = copies(less.fit, added, trials, known.scale.colour, known.task.limits)
-    item = known.scale.evidence(h)
+    evidence = known.scale.evidence(h)
     lost: dict[str, float] = {}
     for name, copy in result.items():
         left = 0.5 * power * (1.0 - copy.share)
         fitted = known.hypotheses.get(less.names | {name})
         reached = -np.inf if fitted is None else known.scale.evidence(fitted)
-        if left < NEAR and reached < item - left - NEAR:
+        if left < NEAR and reached < evidence - left - NEAR:
             lost[name] = left
     return [result[n] for n in sorted(lost, key=lambda n: lost[n])[:_MOST]]
 
@@ -228,8 +228,8 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
     """Fit the base with the sets of two effects and more that promise most together.
 
     The cause that explains most alone, that of `h`, may stand for several and hold the search
-    there: sets without it are tried. Or it is one of them: pairs with what leads beside it are
-    tried, as a fit that adds one cause to the other may end in another minimum than one that begins
+    there: sets without it are tried. Or it is one of them: pairs with what leads with it are
+    tried, as a fit that adds one cause to the other may end in another minimum than one that starts
     with both. These go to their end, since they need more steps for it.
     """
     root, task, price = known.root, known.task, known.scale.limits.price
@@ -244,8 +244,8 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
         )
     ]
     ranked = sorted(every, key=lambda s: price * len(s.names) - s.promise)
-    items = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
-    pairs = [s for s in ranked if s.names in items]
+    with_best = [h.names | {n} for n in known.view(h).screening.leading()[:_PAIRS] if h.causes]
+    pairs = [s for s in ranked if s.names in with_best]
     apart = [s for s in ranked if not s.names & h.names]
     starts = [s for s in [*pairs, *apart] if s.names not in known.hypotheses][:_SETS]
     text = ", ".join("+".join(sorted(s.names)) for s in starts)
@@ -257,7 +257,7 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
     jobs = [(way, s) for way in ways for s in starts]
     results = side_by_side(lambda j: j[0](root, j[1], goal), jobs)
     fitted = [f for f in results if f is not None]
-    better = [f for f in fitted if f.names in items and known.scale.evidence(f) > 0.0]
+    better = [f for f in fitted if f.names in with_best and known.scale.evidence(f) > 0.0]
     tried = sorted((f for f in fitted if f not in better), key=lambda h: -known.scale.score(h))
     # of two fits of one set the better one so far need not be the one that ends lower
     best, others = [*better, *tried[:FINALISTS]], tried[FINALISTS:]
@@ -271,7 +271,7 @@ def fit_sets(known: SearchState, h: Hypothesis) -> None:
 def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
     """Fit children of a hypothesis from their other parents, where those promise more.
 
-    Beside fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
+    With fewer causes a fit may have ended in another minimum, and a deeper one. If causes add up,
     a child gains what both of its parents have gained over what these share.
     """
     evidence = known.scale.evidence
@@ -291,7 +291,7 @@ def fit_from_other_parents(h: Hypothesis, known: SearchState) -> None:
 def fit_rivals(known: SearchState) -> None:
     """Fit to their end the effects that may be in the place of each cause of the answer.
 
-    By their estimated evidence beside the other causes they are not clearly less likely.
+    By their estimated evidence with the other causes they are not clearly less likely.
     """
     best = known.answer
     for cause in best.causes:
@@ -301,8 +301,8 @@ def fit_rivals(known: SearchState) -> None:
         less = known.hypotheses.get(names)
         if less is None:
             continue
-        view, item = known.view(less), known.scale.evidence(less)
-        top = known.scale.evidence(best) - item
+        view, base_evidence = known.view(less), known.scale.evidence(less)
+        top = known.scale.evidence(best) - base_evidence
         near = top - known.task.limits.clearly * temperature(top)
         for name, evidence in view.estimated().items():
             if evidence > near and names | {name} not in known.hypotheses:
@@ -311,5 +311,5 @@ def fit_rivals(known: SearchState) -> None:
         children = [h for h in larger if len(h.names - names) == 1]
         known.remember(less, *(n for h in children for n in h.names - names))
         open_ones = [h for h in children if not h.final]
-        known.finish([h for h in open_ones if known.scale.evidence(h) - item > near])
+        known.finish([h for h in open_ones if known.scale.evidence(h) - base_evidence > near])
     known.admissible = frozenset(n for n, h in known.hypotheses.items() if known.is_admissible(h))

@@ -1,4 +1,4 @@
-"""What a search has found so far: every hypothesis by its causes, and which of them is the best."""
+"""The state of a search: every hypothesis by its causes, and which of them is the best."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -32,8 +32,8 @@ SHARE, NEAR = 0.8, 30.0
 FINALISTS = 3
 #: Fits of one set whose evidence differs by so many nats at most are the same minimum.
 _SAME = 1.0
-#: Effects far behind in the screening are fitted afresh where less than this share of the excess
-#: power is explained.
+#: Effects far behind in the screening are fitted from default values where less than this share of
+#: the excess power is explained.
 _EXPLAINED = 0.8
 
 Names = frozenset[str]
@@ -44,7 +44,7 @@ class SearchState:
     """The hypotheses of a search, from a base fit on. Raises SimulationError where that one fails.
 
     `hypotheses` holds them by their causes, `views` those whose residual was tested, `fitted` the
-    effects fitted beside each, `trials` what effects would add to the base. A search that has ended
+    effects fitted with each, `trials` what effects would add to the base. A search that has ended
     has an `answer`, and the causes of all `admissible` hypotheses; `remarks` say which steps it has
     left out.
     """
@@ -75,7 +75,7 @@ class SearchState:
         return self.hypotheses[NONE]
 
     def conclude(self) -> None:
-        """End the search: choose the answer, look at it, and ask what else is worth having."""
+        """End the search: choose the answer, examine it, and list what else is admissible."""
         self.view(self.best())
         self.answer = self.in_order(self.best())
         self.view(self.answer)
@@ -116,7 +116,7 @@ class SearchState:
             self.notify(kept, "finished" if kept.final else "fitted")
 
     def notify(self, h: Hypothesis, state: State) -> None:
-        """Tell whoever watches the search of a hypothesis."""
+        """Report a hypothesis to the observer of the search."""
         self.task.watch(
             Tried(
                 state,
@@ -131,7 +131,7 @@ class SearchState:
         )
 
     def view(self, h: Hypothesis) -> View:
-        """Look at what a hypothesis leaves; the noise of all others is told from the best one."""
+        """Examine what a hypothesis leaves; the best one gives the noise of all others."""
         old = self.views.get(h.names)
         if old is None or old.of.fit is not h.fit:
             known = self.trials if h.causes else ()
@@ -141,7 +141,7 @@ class SearchState:
         return old
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
-        """Return the hypotheses with one more cause that were fitted beside one, best first."""
+        """Return the hypotheses with one more cause that were fitted to one, best first."""
         children = []
         for name in self.fitted.get(h.names, ()):
             if (child := self.hypotheses.get(h.names | {name})) is not None:
@@ -159,14 +159,14 @@ class SearchState:
     def near(self, h: Hypothesis, best: Hypothesis) -> float:
         """Return the cost, as `h` is weighted, above which a fit does not come near another one.
 
-        Its evidence beside `h` would be below `SHARE` of that one's, and by `NEAR` nats.
+        Its evidence with `h` would be below `SHARE` of that one's, and by `NEAR` nats.
         """
         count, reached = len(h.fit.residuals), cost_beside(best, h)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
         return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
     def remember(self, h: Hypothesis, *names: str) -> None:
-        """Keep that these effects were fitted beside a hypothesis."""
+        """Record that these effects were fitted with a hypothesis."""
         self.fitted[h.names] = tuple(dict.fromkeys([*self.fitted.get(h.names, ()), *names]))
 
     def ranked(self) -> list[Hypothesis]:
@@ -174,7 +174,7 @@ class SearchState:
         return sorted(self.hypotheses.values(), key=lambda h: -self.scale.score(h))
 
     def best(self) -> Hypothesis:
-        """Return the answer so far: of the highest score and worth having, fitted to its end."""
+        """Return the answer so far: of the highest score and admissible, fitted to its end."""
         while True:
             top = next(h for h in self.ranked() if self.is_admissible(h))
             if top.final:
@@ -216,9 +216,9 @@ class SearchState:
     def is_admissible(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
 
-        Each has its parameters inside their ranges and removes what can be told, more than the
-        `form` of the others may miss. A memory adds more than a static curve, each more than noise
-        of another colour, and held-out samples have `confirmed` it.
+        Each has its parameters inside their ranges and removes more than the detection limit, more
+        than the `form` of the others may miss. A memory adds more than a static curve, each more
+        than noise of another colour, and held-out samples have `confirmed` it.
         """
         return all(self._may_hold(h, c, confirmed=confirmed, form=form) for c in h.causes)
 
@@ -277,7 +277,7 @@ class SearchState:
         return bool(before.causes) and few and h.leaves(before) > 1.0 - limits.enough
 
     def small_causes(self, h: Hypothesis) -> tuple[str, ...]:
-        """Name the causes that remove too little beside the others to be told from their form."""
+        """Name the causes that remove no more than the form of the others may miss."""
         less = {c.name: self.hypotheses.get(h.names - {c.name}) for c in h.causes}
         return tuple(n for n, b in less.items() if b is not None and self.is_small(h, b))
 

@@ -98,7 +98,7 @@ def steps_of(known: SearchState) -> list[Step]:
 
 
 def unsearched(base: Fit, task: Task) -> list[Step]:
-    """Return the one step of a base fit that is not worth a search."""
+    """Return the one step of a base fit that is not searched."""
     view = examine(root_of(base, task), task)
     return [Step(view, alone=view.estimated(), evidence=view.estimated())]
 
@@ -106,9 +106,9 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
 def _way(known: SearchState, count: int) -> Hypothesis:
     """Return the hypothesis with the first so many of the best one's causes."""
     best = known.answer
-    item = known.hypotheses.get(best.names_upto(count))
-    if item is not None:
-        return replace(item, causes=best.causes[:count])
+    fitted = known.hypotheses.get(best.names_upto(count))
+    if fitted is not None:
+        return replace(fitted, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
         less = without(best, cause)
         best = best if less is None else less
@@ -208,8 +208,8 @@ def one_of_each(
     Of effects that bend the same curve the best fit stands for all.
     """
     best = sorted(result, key=lambda c: c.fit.cost)
-    items = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
-    groups = same_curves(experiments, items, best[0].fit) if best else ()
+    effects = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(experiments, effects, best[0].fit) if best else ()
     rest = {name for group in groups for name in group[1:]}
     same = tuple(note("same_curve", effects=group) for group in groups)
     return tuple(c for c in result if c.effect not in rest), same
