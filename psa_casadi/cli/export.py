@@ -15,6 +15,7 @@ from psa_casadi.cli.inputs import Inputs, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
+from psa_casadi.errors import InputError
 from psa_casadi.files import atomic_write, make_folder
 
 #: The stack of a system without a model.
@@ -160,6 +161,8 @@ def fmu(
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     targets = inputs.ready(targets)
     if chosen.structure.foreign:
+        if fmi == "3":
+            raise InputError("an FMU that holds another FMU is of FMI 2.0; leave --fmi out.")
         psa.export_extended(chosen, output)
         show_written(output)
         return

@@ -30,7 +30,8 @@ class Fitting:
             that no record has; repeat the option for several.
         zeros: Output of a model of your own whose zero is unknown in each record; repeat the option
             for several.
-        hold: What the inputs of a model of your own do between samples, by default linear.
+        hold: What the inputs of a model of your own do between samples; by default what the
+            records make likelier.
         known_start: The records of a model of your own begin at its declared states.
     """
 

@@ -139,20 +139,21 @@ def _search(
     first = ranked[0][1]
     keep(first)
     sigma = residual_noise(first, experiments)
-    polished: list[Fit] = []
+    polished: dict[str, Fit] = {}
     for name, quick in ranked:
         near = quick.data_cost < (_NEAR if thorough else _CLOSE) * first.data_cost
-        lost = all(f.data_cost > _MISSED * len(f.residuals) for f in polished)
+        lost = all(f.data_cost > _MISSED * len(f.residuals) for f in polished.values())
         misfit = thorough and len(polished) < _FOLLOWED and lost
-        if polished and (polished[0].interrupted or not (misfit or (near and len(polished) < 2))):
+        stopped = any(f.interrupted for f in polished.values())
+        if polished and (stopped or not (misfit or (near and len(polished) < 2))):
             break
         if polished and not thorough and same_place(first, quick, experiments):
             continue
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
-        polished.append(ended)
-        keep(min(polished, key=lambda f: f.data_cost))
-    top = best = min(polished, key=lambda f: f.data_cost)
+        polished[name] = ended
+        keep(min(polished.values(), key=lambda f: f.data_cost))
+    top = best = min(polished.values(), key=lambda f: f.data_cost)
     if not best.interrupted:
         best = with_fast(best, experiments, progress)
         tuned = retuned(best, experiments, progress) if mechanics else best
@@ -171,17 +172,17 @@ def _search(
 
 def _outcomes(
     ranked: Sequence[tuple[str, Fit]],
-    polished: Sequence[Fit],
+    polished: Mapping[str, Fit],
     best: Fit,
     experiments: Sequence[Experiment],
 ) -> tuple[tuple[StartOutcome, ...], set[str]]:
     """Return the outcome of every start, and the parameters in which equally good fits differ."""
     outcomes, not_unique = [], set[str]()
-    for k, (name, quick) in enumerate(ranked):
-        if k >= len(polished):
+    for name, quick in ranked:
+        final = polished.get(name)
+        if final is None:
             outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
-        final = polished[k]
         names = differing(best, final, experiments)
         agrees = final is best or (names == () and equal(best, final))
         not_unique |= set(names)
