@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 #: Modules of functions that make texts, which need no pictures; all others are in `report.shown`.
 _TEXTS = {
     "note_text": "psa_casadi.report.words.notes",
-    "told": "psa_casadi.report.words.text",
+    "diagnosis_text": "psa_casadi.report.words.text",
     "sentence_of": "psa_casadi.report.words.advice_words",
     "identification_file": "psa_casadi.report.documents.files",
 }
