@@ -116,7 +116,7 @@ def write_all(sources: Path) -> list[Work]:
 
 
 def main() -> int:
-    """Compile all sources of a model; return 1 if the compiler complained or missed a file."""
+    """Compile all sources of a model; return 1 if the compiler complains or a file is missing."""
     with tempfile.TemporaryDirectory() as scratch:
         os.environ.setdefault("ZIG_GLOBAL_CACHE_DIR", str(Path(tempfile.gettempdir()) / "zig"))
         work = write_all(Path(scratch))

@@ -4,7 +4,7 @@ Executable are fenced blocks marked `console` (their lines that begin with `$ `;
 backslash go on in the next one, all others are output and are left alone), `python` (a program) and
 `c` (statements of a program that is compiled with the C files of the folder). Each block runs in an
 empty directory, with the checkout's environment first in PATH, two blocks side by side; the output
-of a command is printed when it has ended. A comment on its own line before a block changes that:
+of a command is printed when it has ended. A comment on a separate line before a block changes that:
 
     <!-- run: skip, WHY -->   the block is not run (it installs something, it never ends)
     <!-- run: in-tests -->    the block is run by a test, which looks at what it leaves besides

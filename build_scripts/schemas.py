@@ -45,7 +45,7 @@ def json_schema(record: type) -> dict[str, Any]:
             schema["additionalProperties"] = False
         for name, rules in schema.get("properties", {}).items():
             if rules.get("type") == "object" and name not in schema.get("required", ()):
-                rules.setdefault("default", {})  # msgspec says it from 0.23 on
+                rules.setdefault("default", {})  # msgspec states it from 0.23 on
     root = defined.pop(record.__name__)
     table = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root}
     return {**table, "$defs": dict(sorted(defined.items()))} if defined else table

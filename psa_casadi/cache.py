@@ -1,6 +1,6 @@
 """The user's cache of what takes long to make; what in it is damaged or not the user's is not used.
 
-Every file has its checksum beside it. If the cache cannot be used, a folder that
+A checksum file lies next to every file. If the cache cannot be used, a folder that
 goes with this process replaces it, and one line warns of it.
 """
 

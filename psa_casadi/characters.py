@@ -19,7 +19,7 @@ def barred(text: str) -> str:
 
 
 def check_text(text: str, what: str) -> None:
-    """Refuse a text with a character that no document can carry; `what` begins the sentence.
+    """Refuse a text with a character that no document can carry; `what` starts the sentence.
 
     Raises:
         InputError: there is one; the sentence names it and quotes the text before it.

@@ -1,7 +1,7 @@
 """Child processes that do not outlive this one: programs, and Pythons for what may crash.
 
-Each is the leader of a group of its own, and killed with it when the block that started it ends, or
-by `end_children`, for a process that has to stop.
+Each leads a process group and is killed with that group when the block that started it ends, or by
+`end_children`, for a process that has to stop.
 """
 
 import contextlib

@@ -185,8 +185,8 @@ class Component:
     without which this one means nothing. `remedy` is what can be done about it, if it differs from
     that of its place. `trial_starts` are starts of its memory states at which it is looked for,
     where it does nothing at their ordinary start. `curve` names the quantity over which an effect
-    bends a static curve, in a form of its own: effects with the same one differ, below the
-    resonances, by these forms only. `measured_by` names the input whose measured column holds what
+    bends a static curve: effects with the same one differ, below the resonances, only by the form
+    of the bend. `measured_by` names the input whose measured column holds what
     it adds: with such a column it is no cause. `needs_column` names columns of which a record must
     have one for the effect to be looked for, as it hardly shows otherwise. `more_of` names the
     effect of which this one is several, `count` of them.
@@ -249,7 +249,7 @@ class Component:
         return self.belongs_to not in ("sensor", "environment")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by reference where a table or an own module has it, else with its equations.
+        """Pickle by reference where a table or a user's module has it, else with its equations.
 
         Equations that are no function of a module, such as those of `ode_model`, are kept as a
         function of CasADi.

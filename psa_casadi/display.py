@@ -47,7 +47,7 @@ class Plotted(Celled):
     def plot(self, ax: "Axes | None" = None, output: str | None = None) -> "Figure":
         """Return the picture as a matplotlib figure; a notebook shows it by itself.
 
-        With `ax` or `output` it is one quantity over time, on these axes or on its own: an output
+        With `ax` or `output` it is one quantity over time, on these axes or on new ones: an output
         or state by name, "residual" of a fit or diagnosis, a parameter of a posterior.
 
         Raises:
@@ -65,7 +65,7 @@ class Lined(Celled):
 
 
 class Reported(Plotted, Lined):
-    """What a result can show of itself that has a page of its own."""
+    """What a result with a report page can show of itself."""
 
     def report(self, path: str | os.PathLike[str], *, still: bool = False) -> None:
         """Write the page, one HTML file below 3 MB that needs no network.
@@ -84,7 +84,7 @@ def with_units(columns: Mapping[str, Any], units: Mapping[str, str]) -> dict[str
 
 
 def frame(columns: dict[str, Any]) -> Any:
-    """Return a pandas DataFrame of columns by name. Raises ImportError that says what to do."""
+    """Return a pandas DataFrame of columns by name. Raises ImportError that states what to do."""
     try:
         pandas = import_module("pandas")
     except ImportError as error:

@@ -18,7 +18,7 @@ class InputError(PsaError, ValueError):
     """What the user gave cannot be used.
 
     `problems` holds one sentence for each mistake: what happened, the likely cause, what to do.
-    A single sentence may be given as a plain string. `str(error)` has one problem on each line.
+    A single sentence may be a plain string. `str(error)` has one problem on each line.
     """
 
     def __init__(self, problems: Sequence[str]) -> None:

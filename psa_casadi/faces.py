@@ -26,7 +26,7 @@ from psa_casadi.simulation.start import is_stack
 
 
 def _with_help_of(work: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add to a function's help that of the function for a model of one's own."""
+    """Add to a function's help that of the function for any other model."""
 
     def documented(face: Callable[..., Any]) -> Callable[..., Any]:
         words = f"Of a model of your own, {face.__name__}{signature(work)}:\n\n    {work.__doc__}"
@@ -61,7 +61,7 @@ def identify(
 @_with_help_of(identify_ode)
 @wraps(stack.identify)
 def identify(*inputs: Any, **words: Any) -> Any:
-    """Identify a stack from its records, or a model of one's own, the first argument, from its."""
+    """Identify a stack, or your model (the first argument), from its records."""
     model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return stack.identify(records, model=model, **_known(words, stack.identify))
@@ -100,7 +100,7 @@ def diagnose(
 @_with_help_of(diagnose_ode)
 @wraps(diagnosis.diagnose)
 def diagnose(*inputs: Any, **words: Any) -> Any:
-    """Diagnose a stack's records, or a model of one's own, the first argument, on its."""
+    """Diagnose a stack, or your model (the first argument), on its records."""
     model, records = _models_first(inputs, words)
     if model is None or is_stack(model):
         return diagnosis.diagnose(records, model=model, **_known(words, diagnosis.diagnose))

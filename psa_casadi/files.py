@@ -243,7 +243,7 @@ def written() -> tuple[Path, ...]:
 
 
 def atomic_write(path: str | os.PathLike[str], data: str | bytes) -> None:
-    """Write `data` to `path`, whole or not at all; text is written as UTF-8 with its own line ends.
+    """Write `data` to `path`, whole or not at all; text is written as UTF-8, line ends unchanged.
 
     Raises:
         InputError: `path` cannot be written to, or the text cannot be, with the reason.

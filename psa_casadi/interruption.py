@@ -1,6 +1,6 @@
 """One interrupt (Ctrl-C) ends long work: a flag that compiled code reads while it runs.
 
-Python hands an interrupt to its main thread, and there only between two of its own instructions: a
+Python hands an interrupt to its main thread, and there only between two Python instructions: a
 simulation in C does not see it, nor do fits in other threads. So whoever notices it calls `stop`,
 and every simulation of the same work ends with KeyboardInterrupt before its next sample. What is
 left to do with the best result so far is done after `wrap_up`.

@@ -60,7 +60,7 @@ class Block:
 
     @property
     def model(self) -> Model:
-        """The block as a model, to be exported as C, FMU or Modelica; it begins at its start."""
+        """The block as a model, to be exported as C, FMU or Modelica, with its start values."""
         return self._model
 
     @property
@@ -284,7 +284,7 @@ class AdaptiveFeedForward(_Learning, Following):
     """Feed-forward whose observer follows the stack: the linearising voltage, tracked online.
 
     Each step learns from the displacement measured at the voltage that was returned last, and
-    returns the next one. The wanted force is the wanted displacement times the model's own
+    returns the next one. The wanted force is the wanted displacement times the model's
     stiffness, so that the gain from wish to displacement is held too while k_L drifts.
     """
 

@@ -200,7 +200,7 @@ class _Segment:
 
 
 class _Turn:
-    """Stops where u' (of sign `side`) returns to 0, or a held voltage (`side` 0) begins to move."""
+    """Stops where u' (of sign `side`) returns to 0, or a held voltage (`side` 0) starts to move."""
 
     terminal = True
 

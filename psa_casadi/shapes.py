@@ -114,7 +114,7 @@ def spectrum_force(
 ) -> Expression:
     """Return what stop elements add to the voltage [V]: the polynomials of their plays, summed.
 
-    Plays, squares and cubes have weights of their own, each a sum of `counts` cosines over the
+    Plays, squares and cubes have separate weights, each a sum of `counts` cosines over the
     elements.
     """
     places = [math.pi * (i + 0.5) / len(elements) for i in range(len(elements))]
@@ -177,7 +177,7 @@ def bend(q: Expression, angle: Expression, wave: Expression) -> Expression:
 
     b(q) = cos(a) B(q) + sin(a) S(q) + w W(q), where B = 6 q^2, S = 20 q^3 - 30 q^2 and
     W = 70 q^4 - 140 q^3 + 90 q^2 are the second to fourth Legendre polynomials on 0 <= q <= 1
-    without constant and slope, which a fit of the stack takes for its own (offset and sensitivity,
+    without constant and slope, which a fit attributes to the stack (offset and sensitivity,
     a linear load). So a is the angle between a bow (0) and an S about the middle (pi/2), and any
     cubic is a size and an angle: ratios of coefficients would have to pass through infinity on the
     way from one sign to the other.

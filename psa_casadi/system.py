@@ -1,4 +1,4 @@
-"""The surroundings of a stack: parts, controllers, whole systems, and models of one's own."""
+"""The surroundings of a stack: parts, controllers, whole systems, and any other model."""
 
 from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.design.mechanism.mechanism import mechanism_model, port_model

@@ -106,7 +106,7 @@ _OTHER_UNITS: tuple[Unit, ...] = (
 )
 
 
-#: Every unit that has a symbol of its own, by that symbol.
+#: Every unit that has a symbol, by that symbol.
 UNITS: dict[str, Unit] = {
     f"{prefix}{symbol}": Unit(
         f"{prefix}{symbol}", Fraction(10) ** _POWERS[prefix], 0.0, exponents, quantity=quantity
@@ -236,7 +236,7 @@ def _unknown_symbol(symbol: str, text: str, quantity: str) -> str:
 
 
 def convert(value: Value, from_unit: str, to_unit: str) -> Value:
-    """Return `value`, given in `from_unit`, in `to_unit`.
+    """Return `value` [`from_unit`] in `to_unit`.
 
     Powers of ten convert with a single rounding: 7 um becomes exactly the float 7e-6.
 
@@ -257,7 +257,7 @@ def convert(value: Value, from_unit: str, to_unit: str) -> Value:
 
 
 def to_si(value: Value, unit: str) -> Value:
-    """Return `value`, given in `unit`, in SI base units; counts stay counts.
+    """Return `value` [`unit`] in SI base units; counts stay counts.
 
     Raises:
         InputError: the unit is unknown.

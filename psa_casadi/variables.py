@@ -16,7 +16,7 @@ class Parameter:
     `log`: the parameter spans decades and is searched on a logarithmic scale. `scale` is the size
     of an ordinary change in SI units, where the value itself may be zero. What is not `fitted` only
     sets a scale, or chooses between two forms; records never determine it. `limit`: the lower end
-    of the bounds is a form of its own (a corner that is sharp, a filter of one pole): a value there
+    of the bounds is a limiting form (a corner that is sharp, a filter of one pole): a value there
     is as good as any other.
     """
 
@@ -45,7 +45,7 @@ class State:
 
     A state with `memory` remembers a history that the record does not show (hysteresis, creep): its
     deviation from rest at the start of a record is unknown and is estimated; all others of a stack
-    start at rest. Those of a model of one's own are all estimated, as deviations from `start`,
+    start at rest. Those of any other model are all estimated, as deviations from `start`,
     unless the start is declared known. A memory that `settles` (creep) has an equilibrium; one
     that does not (hysteresis) rests at any value.
     `nominal` is the size the state usually has, a number or a function of the parameter values.

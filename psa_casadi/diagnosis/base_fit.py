@@ -1,7 +1,7 @@
 """Variants of the base fit: resonances and ringing.
 
 After each step of the force a resonance rings, and what the samples show of it is a tone below half
-the sampling rate f_s that decays as fast as the resonance itself, whatever its own frequency: one
+the sampling rate f_s that decays as fast as the resonance, whatever the resonance's frequency: one
 at f appears at |f - k f_s|. Any such tone adds, with unknown amplitude and phase,
 
     q_k = 2 Re(z) q_(k-1) - |z|^2 q_(k-2) + b_0 (F_k - F_(k-1)) + b_1 (F_(k-1) - F_(k-2)),
@@ -79,8 +79,8 @@ def images(tone: float, rate: float, most: int) -> list[float]:
 def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
     """Return the tone that explains most of a residual; None where no record can show one.
 
-    The residual is whitened by its own autoregression, so that a tone has to follow the force to
-    count: one that is there all the time is taken for colour.
+    The residual is whitened by an autoregression fitted to it, so that a tone has to follow the
+    force to count: one that is there all the time counts as colour.
     """
     interval = min(e.record.sample_time for e in fitted(experiments))
     forces = [
@@ -167,7 +167,7 @@ def _response(
     return np.vstack(parts)
 
 
-#: n ln(ratio of rms) by which a resonance of the stack's own may fall short of a further mode, and
+#: n ln(ratio of rms) by which a resonance of the stack may fall short of a further mode, and
 #: of another effect.
 _AS_GOOD, _LIKE = 10.0, 3.0
 #: To what share of the rms one added to the causes must lead.
@@ -234,7 +234,7 @@ def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress
 def instead_of_mode(
     before: Fit, mode: Component, fit: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit with a resonance of the stack's own where a further mode was `fit`.
+    """Fit with a resonance of the stack in the place of the further mode in `fit`.
 
     `before` is the model to which the mode was added. A stack that rings near the sampling rate
     shows a tone at one of its images, |k f_s + f| and |k f_s - f|, which decays as fast: its
@@ -254,7 +254,7 @@ def instead_of_mode(
 def instead_of(
     base: Fit, fit: Fit, experiments: Sequence[Experiment], progress: Progress
 ) -> Fit | None:
-    """Fit the base with resonances of its own where an effect was `fit`.
+    """Fit the base with its resonances in the place of the effect in `fit`.
 
     None where no masses explain the data about as well as the effect. A resonance above the band
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave

@@ -27,7 +27,7 @@ class Colour:
 
     `autoregression` holds (a_1 ... a_p) of every record, empty for white noise; `lengths` are the
     records' numbers of samples. `further` are the colours of the columns besides the displacement,
-    each with a level in its own unit. The first samples of a record count over the noise's rms, or
+    each with a level in its unit. The first samples of a record count over the noise's rms, or
     with 0 where a record has no `known_start`; every sample over its `spread` (samples,),
     where the noise is not as large everywhere.
     """

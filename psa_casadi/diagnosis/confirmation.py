@@ -94,10 +94,10 @@ def held_out_excess(
     """Return by which factor held-out errors exceed those of the fit; 1 where noise would do so.
 
     Samples of records that are fitted for the most part are compared with the fitted ones: the
-    innovations of the residual's own `colour`. The ratio F of their mean squares is
+    innovations by the `colour` of the residual. The ratio F of their mean squares is
     about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
     samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
-    are held out are compared with their own `noise`: parameters that the fitted ones leave open
+    are held out are compared with their `noise`: parameters that the fitted ones leave open
     make an error there too, so that only a clear excess counts. One below the detection limit of a
     stack does not.
     """

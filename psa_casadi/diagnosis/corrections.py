@@ -1,7 +1,7 @@
 """Unnamed corrections of a model: their forms, and what each would remove.
 
 About the fitted model everything is linear: measured - predicted = J d + C w + noise, d the change
-of the model's own parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
+of the model's parameters, w ~ N(0, (s p)^2) the weights of one correction. The size s is that
 of the largest evidence. The evidence is on the scale of the hypotheses' score.
 
 A correction is a sum of columns with weights w_k ~ N(0, (s p_k)^2): s its size, estimated from the
@@ -47,9 +47,9 @@ from psa_casadi.units import FloatArray
 
 #: Relaxations per decade, modes.
 _PER_DECADE, MODES = 2, 24
-#: Damping ratio of modes; relaxations go to so many times the record.
+#: Damping ratio of modes; longest time constant of relaxations over the longest record.
 _DAMPING, _LONGEST = 0.05, 3.0
-#: A mode rings so many times in the longest record, and within a hundred samples.
+#: Fewest periods of a mode in the longest record; lowest frequency of one over the sampling rate.
 _PERIODS, _SLOWEST = 8.0, 0.01
 
 
@@ -198,7 +198,7 @@ class Estimate:
 
 
 def estimates(effect: Component, model: Model) -> dict[str, Estimate]:
-    """Return what a fitted model's provenance says of an effect's own parameters."""
+    """Return the estimates of an effect's parameters from a fitted model's provenance."""
     known = model.provenance.intervals
     return {
         p.name: Estimate(model.values[p.name], p.unit, (known[p.name].low, known[p.name].high))
@@ -244,8 +244,8 @@ class Correction:
 class Patch(Correction):
     """One of a stack: its kind of columns at a port of the plant, and what it adds.
 
-    `weights` [m] are those of the kind's columns, `added` [m] their own part of `predicted` [m];
-    `moved` is how far the model's own theta follows.
+    `weights` [m] are those of the kind's columns, `added` [m] their part of `predicted` [m];
+    `moved` is how far the model's theta follows.
     """
 
     kind: str
@@ -356,7 +356,7 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
 
 
 class _Following:
-    """The model's own parameters, which follow a correction as far as prior and bounds let them."""
+    """The model's parameters, which follow a correction as far as prior and bounds let them."""
 
     def __init__(
         self,
@@ -475,12 +475,13 @@ def responses(
 def with_patch(
     before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> Fit:
-    """Return a fit with the correction added to the model, begun with the weights that it has.
+    """Return a fit with the correction added to the model, started from the correction's weights.
 
-    The model's own values begin where they follow the correction, and where they were.
+    Of two fits, one starts from the model's values as they follow the correction, one from those
+    of `before`; the better one is returned.
 
     `predicted` [m] are the predictions of `before`. Raises InputError for a kind that no component
-    stands for, SimulationError where it cannot be simulated.
+    represents, SimulationError where it cannot be simulated.
     """
     component = patches.PATCHES.get((patch.kind, patch.port))
     if component is None:

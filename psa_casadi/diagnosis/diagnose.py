@@ -62,7 +62,7 @@ _TAPS, _EACH = 128, 8
 class Driven:
     """Whether a displacement follows the voltage, and what of sign and unit is wrong.
 
-    `filtered` says that it does not follow by the base model, but by another linear one.
+    `filtered`: it does not follow by the base model, but by another linear one.
     """
 
     follows: bool
@@ -222,7 +222,7 @@ def decided(
 ) -> Note:
     """Return what a column decided, from what is named with it and without it.
 
-    `clear` says that nothing is left to name with the column.
+    With `clear` nothing is left to name with the column.
     """
     before = tuple(then.items())
     gone, new = [n for n in then if n not in now], tuple(n for n in now if n not in then)
@@ -246,7 +246,7 @@ def decided(
     )  # fmt: skip
 
 
-#: So many further stuck readings justify a second search.
+#: Number of further stuck readings that justify a second search.
 MORE = 3
 
 
@@ -329,7 +329,7 @@ def _prepared(
 ) -> tuple[Model, Task, bool, list[Note | str]]:
     """Return where the base fit starts, the task with its experiments, and notes on the records.
 
-    And whether the force scale is given; `kept` are records that are held out, `cut` the notes on
+    And whether the force scale is known; `kept` are records that are held out, `cut` the notes on
     their gaps. Raises InputError.
     """
     clean, notes, hidden = _cleaned(records)

@@ -74,18 +74,18 @@ def families(
 ) -> tuple[Family, ...]:
     """Return the families that a cause may belong to, the most probable first.
 
-    `probability` is that of each effect, given that it is a listed one, `places` has their
-    families; what is `shown` of the cause is over the model without it, with the `corrections` of
-    that model. With the evidence F_k, above the price of a cause, of each correction and that E of
-    the cause, the odds that it is not listed are
+    `probability` is that of each effect on condition that the cause is a listed one, `places` has
+    their families; `shown` is the evidence of the cause over the model without it, `corrections`
+    are those of that model. With the evidence F_k, above the price of a cause, of each correction
+    and that E of the cause, the odds that it is not listed are
 
         sum_k exp((F_k - E*) / T),   T = max(temperature 2, further E)
 
     over corrections whose kind no likely effect has; E* is E, or F of one of its kind if larger.
     One of its kind has more freedom: it counts where `enough` of its F is more than E.
     Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
-    lacks the cause says little of it. One whose kind nobody has declared may be of any. What is
-    missing to 1 is of no kind that was tried (`CauseEvidence.listed_probability`).
+    lacks the cause holds little information on it. One whose kind nobody has declared may be of
+    any. What is missing to 1 is of no kind that was tried (`CauseEvidence.listed_probability`).
     """
     evidence = shown.evidence
     form = limits.further if probability else limits.form_of_unnamed

@@ -67,7 +67,7 @@ class Term:
 
     @property
     def whole(self) -> bool:
-        """Whether its factor is 1: h alone says how much it is."""
+        """Whether its factor is 1: h alone determines its size."""
         return self.form == "less"
 
     @property
@@ -91,7 +91,7 @@ class Term:
 class Place:
     """A port, its variables `names`, and the symbols, sizes and units of what a term may have.
 
-    That is the variables, and of an intermediate its own value by its equation.
+    Those are the variables and, at an intermediate, the value of its equation.
     """
 
     port: Port
@@ -107,18 +107,18 @@ class Place:
         return f"law_in_{self.port.kind}_{self.port.variable}"
 
     def polynomial(self) -> list[Term]:
-        """Return the terms of a free function; of a signal none that are its own gain."""
+        """Return the terms of a free function; of a signal without the linear one, its gain."""
         powers = range(2, _OF_SIGNAL + 1) if self.of_signal else range(1, _FACTORS + 1)
         few = self.names[:_OF_STATES]
         return [Term(t) for p in powers for t in combinations_with_replacement(few, p)]
 
     @property
     def of_signal(self) -> bool:
-        """Whether it is an input or an output, of which its own value is the only variable."""
+        """Whether it is an input or an output, whose value is the only variable."""
         return self.port.kind in ("input", "output")
 
     def library(self) -> Iterator[Term]:
-        """Return every term that is tried; those of a signal's own gain are no formula."""
+        """Return every term that is tried; those of a signal's gain are no formula."""
         for count in range(2 if self.of_signal else 0, _FACTORS + 1):
             for factors in combinations_with_replacement(self.names, count):
                 yield Term(factors)

@@ -33,9 +33,9 @@ from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of, states_of
 from psa_casadi.units import FloatArray
 
-#: So many ports are fitted.
+#: Number of ports that are fitted.
 _FITTED = 2
-#: A formula stands for a free function if it misses at most so many times as much.
+#: Largest ratio of the error of a formula to that of the free function that it replaces.
 _AS_WELL = 1.1
 #: Powers of a variable that what is added is compared with.
 _POWERS = 5

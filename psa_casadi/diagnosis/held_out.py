@@ -26,7 +26,7 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment, counted
 from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
-#: Held-out records from which on they are the parts; else so many blocks of each are.
+#: Fewest held-out records that serve as the parts; number of blocks of each that do otherwise.
 FEWEST_RECORDS, _BLOCKS = 4, 8
 
 
@@ -221,7 +221,7 @@ class Share:
     def percents(self) -> tuple[str, str, str]:
         """The same as percentages without their sign, with decimals where all are near 0 or 1.
 
-        A share that is not 0 is never shown as 0, one below 1 as 100 only from 99.995 on.
+        A share that is not 0 is never printed as 0, one below 1 as 100 only from 99.995 on.
         """
         share, low, high = self.clipped
         off = min(1.0 - self.interval[0], self.interval[1])

@@ -40,8 +40,9 @@ from psa_casadi.units import FloatArray
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")
-#: Causes cancel each other where one of them changes an output so many times as all together do:
-#: three wrong names for a heat capacity that changes reach 20, causes of other places about 1.
+#: Smallest ratio of the change of an output by one cause to that by all together at which causes
+#: cancel each other: three wrong names for a heat capacity that changes reach 20, causes of other
+#: places about 1.
 _CANCEL = 5.0
 
 
@@ -75,8 +76,8 @@ def indistinguishable(step: Step, limits: Thresholds) -> tuple[str, ...]:
 class Judge:
     """What follows from the steps of a search, each computed when it is used.
 
-    Of records whose output is not `driven` by the input nothing is named. What depends on the kind
-    of device are the methods of the first part; a stack has its own.
+    Of records whose output is not `driven` by the input nothing is named. The methods of the first
+    part depend on the kind of device; a stack overrides them.
     """
 
     def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
@@ -135,7 +136,7 @@ class Judge:
         return self._left[step]
 
     def _shown(self, evidence: float) -> CauseEvidence:
-        """Return what a cause has given the others that has so much evidence."""
+        """Return the `CauseEvidence` of a cause from its evidence conditional on the others."""
         return CauseEvidence(evidence, len(self.first.fit.residuals), len(self.last.view.of.causes))
 
     @property
@@ -146,7 +147,7 @@ class Judge:
     def weigh(self, before: Hypothesis, after: Hypothesis, *, beside: bool = True) -> Weighed:
         """Weigh the causes that one hypothesis has more than another against corrections of that.
 
-        Without any corrections where it is not `beside` them. A channel counts by itself where
+        Without any corrections if `beside` is False. A channel counts by itself where
         there are several, and the other's held-out rms is above `EXCESSIVE` times the noise:
 
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
@@ -217,7 +218,7 @@ class Judge:
 
     @property
     def unnamed(self) -> set[str]:
-        """Causes that are vague, or without which the model is as likely."""
+        """Causes that are rather not listed effects, or without which the model is as likely."""
         price = self.limits.price
         return {*self.unlisted, *(n for n, w in self.each.items() if w.evidence <= price)}
 
@@ -353,7 +354,7 @@ class Judge:
         )
 
     def withdrawn(self) -> tuple[Note, ...]:
-        """Return which names were found but not named, and why."""
+        """Return which causes of the search are not named, and why."""
         names = tuple(s.cause.name for s in self.searched)
         if not names:
             return ()
@@ -375,7 +376,7 @@ class Judge:
 
     @property
     def remarks(self) -> tuple[Note | str, ...]:
-        """Which names were withdrawn, which causes are too vague or too small to be named."""
+        """Which names are withdrawn; which causes are too uncertain or too small to be named."""
         notes = self.withdrawn() if self.verdict == "unexplained" else ()
         if self.unlisted and self.verdict != "unexplained":
             # they stay in the model without a name

@@ -24,7 +24,7 @@ Source = Literal["repeats", "holds", "fast part"]
 ENOUGH = 200
 #: Samples from which the colour of the noise is known without a model.
 _COLOUR = 500
-#: Lags of the autocovariance that a first-order autoregression is given with.
+#: Number of lags of the autocovariance that is stored for a first-order autoregression.
 _LAGS = 30
 
 
@@ -32,9 +32,9 @@ _LAGS = 30
 class NoiseFloor:
     """The noise of one record: standard deviation `level` [m, or counts] and where it comes from.
 
-    `autocovariance` (lags,) [m^2] begins at lag 0 and is that of `level`; `autoregression` (p,) is
+    `autocovariance` (lags,) [m^2] starts at lag 0 and is that of `level`; `autoregression` (p,) is
     empty for white noise; `samples` is what the level rests on. `quantum` is the step between the
-    sensor's levels, None where it shows none; `finding` says all this.
+    sensor's levels, None where it shows none; `finding` states all this.
     """
 
     record: str
@@ -70,7 +70,7 @@ def pooled_level(
     """Return the rms of the noise over all records [m].
 
     Where no voltage was repeated that of the residual's fast part counts, at most that of noise of
-    the given colour and at least that of rounding: a hold may ring.
+    this `colour` and at least that of rounding: a hold may ring.
     """
     counts = [np.count_nonzero(np.isfinite(e)) for e in residuals]
     powers = [
@@ -100,7 +100,7 @@ def detection_limit(
 ) -> float:
     """Return the rms [m] below which a `residual` (n,) is uninformative of a stack.
 
-    It is that of the simulation's own largest `error` [m], of the form that no model has exactly
+    It is that of the simulation's largest `error` [m], of the form that no model has exactly
     (`form_of_range`), and of rounding in the sensor or the file where the residual is hardly
     more than that.
     """
@@ -165,7 +165,7 @@ def _resolution(record: Record) -> tuple[float | None, float, float]:
 
 @lru_cache(maxsize=64)
 def _source(record: Record) -> tuple[Source, MeasuredNoise | None, Note]:
-    """Return the best source that needs no model, what it says, and how it does so."""
+    """Return the best source that needs no model, the noise that it measures, and a note on it."""
     again = repeats(record)
     if again is not None and again.samples >= ENOUGH:
         return "repeats", again, note("noise_repeats", apart=(again.distances[0], "s"))

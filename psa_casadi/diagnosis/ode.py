@@ -90,7 +90,7 @@ def diagnose_ode(
     searched by the score of a stack's diagnosis: evidence less 8 nats for every cause, confirmed by
     held-out samples. These are the records `holdout`, else a quarter of every record in blocks.
     `leave_out` names effects, or beginnings of their names such as "zero_of", that cannot be;
-    `effects` are components of your own, which are searched with these: each has a gain and adds
+    `effects` are your components, which are searched with these: each has a gain and adds
     a term to a port (`applied_u` of an input u, `rate_x` of a state x, `shown_y` of an output y).
     Other words are those of `identify`. `watch` gets every hypothesis of the search (`Tried`).
 
@@ -169,7 +169,7 @@ def _given(
 class _Way:
     """A search from one fit, of whole records or of their parts (`runs`), with `notes`.
 
-    `made` gives the whole records; `hold_known` tells whether a user has declared what inputs do
+    `made` returns the whole records; `hold_known` states whether a user has declared what inputs do
     between samples. `so_far` gets every fit that is better than those before it.
     """
 

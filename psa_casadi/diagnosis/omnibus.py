@@ -16,7 +16,7 @@ from psa_casadi.units import FloatArray
 Structure = Literal["correlation", "line", "drive", "size", "effect"]
 
 _LAGS = 25
-#: So many times more rarely a correlation counts with the residual's own colour.
+#: Factor on the p-value of the correlation where the colour is that of the residual.
 _LEFT = 100.0
 #: Squares of the residual over their mean that count at most.
 _MOST = 9.0
@@ -63,15 +63,15 @@ def omnibus(
     own: bool,
     alarms_below: float,
 ) -> Omnibus:
-    """Test a residual (samples,) [m] for structure that noise of the given colour does not have.
+    """Test a residual (samples,) [m] for structure that noise of this colour does not have.
 
     Four tests with Bonferroni's correction: are neighbours of the whitened residual correlated;
     Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
-    misfit is not. Where the colour is the residual's `own`, its jitter is for the size, and its
+    misfit is not. With `own` the colour is the residual's: its jitter covers the size, and its
     order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share
-    of the residual's power above the noise `floor` [m]; what it finds must be larger than what is
-    `knowable` [m]; `lengths` are the records' numbers of samples.
+    of the residual's power above the noise `floor` [m]; structure must be larger than
+    `detection_limit` [m] to count; `lengths` are the records' numbers of samples.
     """
     white = colour.whiten(residual)
     p, share = whiteness(white)

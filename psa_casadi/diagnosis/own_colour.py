@@ -150,7 +150,7 @@ def own_colour(
 def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
     """Return the ends of all windows without gaps in all records that are longer than an order.
 
-    And where the records begin, and that order, the highest one that so many windows determine.
+    Also where the records start, and that order, the highest one that this many windows determine.
     """
     used = np.concatenate(fitted).astype(np.bool_)
     starts = np.cumsum([0, *(len(rows) for rows in fitted[:-1])])
@@ -162,7 +162,7 @@ def windows(fitted: Sequence[BoolArray]) -> tuple[IndexArray, IndexArray, int]:
 
 
 def price_of(order: int, samples: int) -> float:
-    """Return what so many coefficients cost the likelihood of samples [nats] (Schwarz)."""
+    """Return what `order` coefficients cost the likelihood of samples [nats] (Schwarz)."""
     return 0.5 * order * float(np.log(samples + 2.0))
 
 
@@ -218,7 +218,7 @@ def _innovations(signal: FloatArray, at: IndexArray, a: FloatArray) -> FloatArra
 def _ends(
     there: BoolArray, indices: IndexArray, most: int, ends: BoolArray | None = None
 ) -> IndexArray:
-    """Return the samples, of some `ends`, with so many before them without a gap in one record."""
+    """Return the samples, of some `ends`, with `most` before them without a gap in one record."""
     index = np.arange(len(there))
     first = there & ~np.concatenate([[False], there[:-1]])
     first[indices[indices < len(there)]] = True

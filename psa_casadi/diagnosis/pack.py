@@ -136,7 +136,7 @@ class StackPack(Pack):
         return cause.is_inside_ranges(values)
 
 
-#: The stack of a diagnosis of records that come without a model of one's own.
+#: The pack of a diagnosis of records that come without a user's model.
 STACK = StackPack()
 
 

@@ -45,9 +45,9 @@ from psa_casadi.units import FloatArray
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are resolved.
 _PEAKS, _FINER = 4, 8
-#: Bins of the displacement; periods between so many of them over the range are tried.
+#: Bins of the displacement; fewest and most periods over the range that are tried.
 _BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
-#: A jump is the difference of the means over so many bins on either side.
+#: Number of bins on either side whose means differ by a jump.
 _SIDE = 64
 
 
@@ -135,9 +135,9 @@ _FROM_RESIDUAL = {
     DISPLACEMENT_PEAKS: residual_periods,
     DISPLACEMENT_STEPS: residual_jumps,
 }
-_RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's own tolerance
-#: A column along the course of a fit counts where the fitted parameters leave so many times of it
-#: what it may err by; else the effect is simulated.
+_RTOL = 1e-4  # of derivatives; finite steps are differences and need the fit's tolerance
+#: Smallest ratio of what the fitted parameters leave of a column along the course of a fit to what
+#: it may err by; below it the effect is simulated.
 _CLEAR = 3.0
 #: A tangent that may err by this share of its size is no tangent.
 _ROUGH = 0.05
@@ -151,7 +151,7 @@ class Direction:
 
     `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
     times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
-    history. `one_sided` says that only positive multiples make sense. `further` are the same
+    history. `one_sided`: only positive multiples make sense. `further` are the same
     changes of the further columns, in their units, without what their offsets can follow. `weight`
     names the parameter that moves, of several that an effect is linear in (see `spans`).
     """
@@ -200,7 +200,7 @@ def directions(
 def tangents(
     fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
 ) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
-    """Return what each of many effects without own states changes, for its gain's ordinary size.
+    """Return what each of many effects without states changes, for its gain's ordinary size.
 
     In fitted samples (samples,), and in every further channel. All at once in one model, or along
     the fit's course, where they have laws; without those that may err by more than `_ROUGH`.

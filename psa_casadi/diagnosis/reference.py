@@ -7,7 +7,7 @@ device, is learnt and taken off the new displacements,
     y' = y - d(v),   d = Phi(v) w,   or the mean of what is left wherever v was played before.
 
 Phi holds the forms of the unnamed corrections that follow the voltage (`corrections.KINDS`), all at
-once, with w_k ~ N(0, (s p_k)^2) and a size s of its own for each form: the sizes that predict
+once, with w_k ~ N(0, (s p_k)^2) and a separate size s for each form: the sizes that predict
 held-out blocks of what is left best. Of y' the causes are named as ever, in fewer steps: there is
 no base to be fitted again. By what healthy records are predicted from one another worse than their
 noise a sound device may differ: less than that is nothing that changed.
@@ -44,15 +44,15 @@ _FORMS = (
     ("curve", "drive voltage"), ("direction", "force"), ("memory", "force"),
     ("relaxation", "force"), ("modes", "force"),
 )  # fmt: skip
-#: Relaxations are used that are so many times shorter than the shortest record: slower ones hang on
-#: what was before.
+#: Smallest ratio of the shortest record to the time constant of a relaxation that is used: slower
+#: ones depend on what was before.
 _SETTLES = 10.0
-#: Blocks of all healthy samples, of which every so many are held out in turn.
+#: Number of blocks of all healthy samples, and of the folds that hold them out in turn.
 _BLOCKS, _FOLDS = 12, 6
 #: Sizes s that are tried, over the noise; rounds through all forms, while they gain this share.
 _SIZES, _ROUNDS, _GAIN = (0.0, *np.geomspace(0.01, 100.0, 9).tolist()), 3, 1e-3
-#: Voltages are the same to this share of their range, rms; so much of the new record is found
-#: again, at so many places at most; sampling intervals differ by no more than that share.
+#: Share of their range, rms, to which voltages are the same; least share of the new record that
+#: recurs, largest number of places; largest relative difference of sampling intervals.
 _SAME, _FOUND, _PLACES, _STEP = 2e-3, 0.9, 64, 1e-3
 #: Evaluations of a fit of the base to a part of the healthy records, or of one of its parameters.
 _EVALUATIONS = 12
@@ -78,7 +78,7 @@ _NOTHING, _SCALES = ("adequate", "not_driven"), ("k_P", "k")
 #: A parameter has changed where it leaves no more than this share of what has; it replaces causes
 #: where it leaves less than this share of what they do, from a share of the noise on.
 _REST, _CLEARLY, _FORM = 0.1, 0.5, 0.3
-#: Parameters that leave less than so many times the best one explain as much.
+#: Ratio of rms to that of the best parameter below which a parameter explains as much.
 _ALIKE = 1.02
 
 
@@ -214,7 +214,7 @@ class Healthy:
 class Since:
     """New records with what the sound device adds to the base on them, `added` (n,) [m].
 
-    Only samples count whose voltage is `covered` (n,) by healthy records; all of it was found at
+    Only samples count whose voltage is `covered` (n,) by healthy records; all of it recurs at
     `places` among these.
     """
 
@@ -225,7 +225,7 @@ class Since:
     places: int
 
     def taken_off(self, first: int) -> tuple[tuple[Record, ...], tuple[Record, ...]]:
-        """Return the new records without it, the first so many and the others."""
+        """Return the new records without it, the first ones (as many as `first`) and the others."""
         rows = zip(self.records, self.added, self.covered, strict=True)
         result = tuple(
             replace(r, displacement=np.where(s, measured(r) - a, np.nan)) for r, a, s in rows
@@ -250,7 +250,7 @@ class Since:
         return replace(method, without=method.without | _BASE_STEPS, thresholds=limits)
 
     def deaf(self, method: Method, level: float) -> Method:
-        """Return the method to which less than a level, rms [m], says nothing."""
+        """Return the method for which less than a level, rms [m], does not count."""
         widest = max(r.range_m for r in self.records)
         limits = replace(method.thresholds, form_of_range=_DEAF * level / widest)
         return replace(method, thresholds=limits)
@@ -333,7 +333,7 @@ def _twice(record: Record) -> Experiment:
 def _ridge(columns: FloatArray, target: FloatArray, which: npt.NDArray[np.integer]) -> FloatArray:
     """Return the weights of columns (n, k), by the sizes that predict held-out blocks best.
 
-    `which` (k,) says to which form a column belongs; every form has a size.
+    `which` (k,) is the form to which each column belongs; every form has a size.
     """
     noise, size = max(high_frequency_noise(target), 1e-300), columns.shape[1]
     squares = np.zeros((_FOLDS, size, size))

@@ -37,7 +37,7 @@ from psa_casadi.units import FloatArray
 _HELD, _STEP = (10.0, 600.0), 0.02
 #: Samples of one way, and how long a slow one takes [s].
 _SAMPLES, _SLOW = 200, 1.0
-#: Tolerance of the runs over the range of the displacement: both err alike.
+#: Tolerance of the runs over the range of the displacement: both err by the same share.
 _RTOL = 1e-5
 #: Resonances that are listed, and the smallest change of the response there that counts.
 _MOST, _TOLD = 3, 0.02

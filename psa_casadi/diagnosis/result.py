@@ -1,4 +1,4 @@
-"""What a diagnosis says of any model, and what more of a stack; DIAGNOSIS.json."""
+"""The result of a diagnosis of any model, and what a stack's adds to it; DIAGNOSIS.json."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -201,11 +201,11 @@ class Diagnosis(Reported):
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
     effects tried, `errors` those of every measured output. `missed` is what the base leaves,
-    `remaining` what the extended model does. `budget` says where the base's held-out error goes,
+    `remaining` what the extended model does. `budget` states where the base's held-out error goes,
     `patch` is the unnamed correction that would remove most of what the named causes leave,
     `families` are the places and kinds that this may be of.
-    `doubted` says why held-out samples cannot confirm a cause, None where they can; `remarks` what
-    else there is to say. `noise_kinds` are those in what the extended model leaves of every output.
+    `doubted` states why held-out samples cannot confirm a cause, None where they can; `remarks` are
+    all other notes. `noise_kinds` are those in what the extended model leaves of every output.
     """
 
     verdict: Verdict
@@ -228,7 +228,7 @@ class Diagnosis(Reported):
     noise_kinds: tuple[NoiseFound, ...] = ()
 
     def with_noise(self, noise: Sequence[NoiseFound], remarks: Sequence[Note | str]) -> Self:
-        """Return it with the noise that its extended model leaves, and what is `remarks` beside.
+        """Return it with the noise that its extended model leaves, and with further `remarks`.
 
         A reading that jumps a few times and stays there is no noise: nothing is `adequate` then.
         """
@@ -445,7 +445,7 @@ def unnamed_causes(budget: Budget | None, causes: tuple[Cause, ...]) -> tuple[st
 class DiagnosisInterrupted(KeyboardInterrupt):
     """A keyboard interrupt ended a diagnosis; `model` is the best so far, marked as interrupted.
 
-    Its effects, if it has any, were not judged. `str(error)` says what the model is.
+    Its effects, if it has any, were not judged. `str(error)` states what the model is.
     """
 
     def __init__(self, model: Model) -> None:

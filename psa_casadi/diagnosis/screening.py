@@ -5,7 +5,7 @@ decrease of the sum of squares is compared with one threshold for the maximum ov
 drawn from Gaussian noise along the actual directions (family-wise; Davies 1987, Hansen 1996).
 
 A base fit bends itself to several missing causes at once, so that the effect that explains most
-alone need not be one of them. Linear in the gains, the best set of so many effects (best subset
+alone need not be one of them. Linear in the gains, the best set of each size (best subset
 regression) costs one small system of equations each, over products of directions that are known.
 
     ln B = (n - k)/2 ln(S_before / S_after) - 1/2 ln det(1 + P H P)
@@ -33,8 +33,8 @@ from psa_casadi.units import FloatArray, IndexArray
 
 _DRAWS = 4000
 _SEED = 20150810  # of the threshold's simulation: the same data give the same verdict
-#: An effect whose score is below this share of the best one is not fitted; so many of the others
-#: are, more of them where their scores are this close to the best one's.
+#: Share of the best score below which an effect is not fitted; number of the others that are, and
+#: largest number where more have a score above the last share of the best one.
 _WORTH, _LEADING, _MOST, _AS_NEAR = 0.1, 4, 7, 0.4
 
 
@@ -355,7 +355,7 @@ def best_sets(
     texts: Sequence[Sequence[str]] = (),
     limits: Thresholds = LIMITS,
 ) -> list[Together]:
-    """Return the best directions of every set of so many effects, the best set first.
+    """Return the best directions of every set of `size` effects, the best set first.
 
     The fitted parameters are free to follow. Gains have the sign that makes sense. Of sets that are
     the same but for effects that are `texts` only the best one is returned.
@@ -399,7 +399,7 @@ def best_sets(
 def evidence(before: Fit, after: Fit, colour: Colour) -> float:
     """Return ln B of a fit with one more effect over the fit without it.
 
-    The log-likelihoods of displacement and further columns add up, each with its own noise level.
+    The log-likelihoods of displacement and further columns add up, each with its noise level.
     """
     # what is left besides the unknowns to estimate the noise
     share = max(len(before.residuals) - before.unknowns.size, 0) / len(before.residuals)
@@ -495,7 +495,7 @@ def temperature(largest: float, limits: Thresholds = LIMITS) -> float:
 def probabilities(
     evidences: Mapping[str, float], whole: float = 0.0, limits: Thresholds = LIMITS
 ) -> dict[str, float]:
-    """Return the probability of each effect, given that one of them is the cause.
+    """Return the probability of each effect, on condition that one of them is the cause.
 
     `whole` is the evidence of the model with the cause over the plain base, where the effects'
     evidence is that over other causes and a better base.

@@ -42,13 +42,14 @@ _NOISE, _BAND = 0.02, 0.1
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """An effect seen on a stack; arrays (n,) over `time` [s], displacements in m.
+    """The signature of an effect on a stack; arrays (n,) over `time` [s], displacements in m.
 
     `base` is the reading without the effect, offset and slope fitted to `changed`, the one with it.
     `size` is that of the parameter `gain` in `unit`. `telling` is the view of the difference that
-    says most of it: binned means along `coordinate` (n,), nan where it has no value, of `counted`
-    (n,), the difference with the sign that the view gives it. Both are empty for a spectrum, whose
-    `telling` holds amplitude densities [m/sqrt(Hz)]. Its share is that of the difference's power.
+    explains most of it: binned means along `coordinate` (n,), nan where it has no value, of
+    `counted` (n,), the difference with the sign that the view gives it. Both are empty for a
+    spectrum, whose `telling` holds amplitude densities [m/sqrt(Hz)]. Its share is that of the
+    difference's power.
     """
 
     effect: str
@@ -166,7 +167,7 @@ def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
 
 
 def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, FloatArray]:
-    """Return the view that says most of the difference, its coordinate, and what it counts."""
+    """Return the view that explains most of the difference, its coordinate, and what it counts."""
     d = play.changed - play.base
     if SPECTRAL_PEAKS in effect.probe.values():
         return _spectrum(play.time, d), np.zeros(0), np.zeros(0)

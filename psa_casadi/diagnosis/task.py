@@ -33,9 +33,9 @@ class Thresholds:
     What counts as an explanation:
 
     * `price`: prior of a cause [nats], and its least evidence where each residual may be noise of a
-      colour of its own. The largest of any effect on 114 of 115 clean records was 7.8; on 30 with
-      odd noise and colours of their own 11.2 once.
-    * `further`: share of what the other causes remove that a further one must. An effect's own form
+      separate colour. The largest of any effect on 114 of 115 clean records was 7.8; on 30 with
+      odd noise and separate colours 11.2 once.
+    * `further`: share of what the other causes remove that a further one must. An effect's form
       is not the true one; less may be that. So is an unnamed correction of another kind as likely
       as a cause within this share of its evidence.
     * `static`: share of what a cause with a memory adds that may be a curve of the voltage alone.
@@ -94,7 +94,7 @@ class Thresholds:
     falling: float = -0.5
 
 
-#: The constants of every diagnosis that is given no others.
+#: The default constants of a diagnosis.
 LIMITS = Thresholds()
 
 #: Sampling interval [s] below which a stack may ring within the record's band.
@@ -105,7 +105,7 @@ _TELL_BENDS = ("displacement_2", "strain")
 
 #: The steps of the method that a diagnosis can go without, to show what each is good for.
 STEPS = (
-    "one clock",  # readings stay on a clock of their own, whatever the data say
+    "one clock",  # readings stay on a separate clock, whatever the data say
     "remainder",  # the noise's colour is that of the residual, not of what nothing explains
     "finite steps",  # effects whose derivative vanishes at their null are not sought by a step
     "fits afresh",  # no fits from an ordinary base besides those from the fitted one
@@ -135,7 +135,7 @@ class Method:
     """The method, `without` some of its `STEPS`, with its deciding constants.
 
     `budget` is the work of a search (steps of simulations times one more than the derivatives
-    beside them) beyond which it starts nothing more.
+    with them) beyond which it starts nothing more.
     """
 
     without: frozenset[str] = frozenset()
@@ -151,7 +151,7 @@ State = Literal["fitted", "finished", "visited", "best"]
 class Tried:
     """A hypothesis of a search at the moment that it is reported.
 
-    `state` says why: it was "fitted", its fit went on to its end ("finished"), its neighbours are
+    `state` is why: it was "fitted", its fit went on to its end ("finished"), its neighbours are
     fitted next ("visited"), or it is the answer ("best"). `causes` are added to the base in the
     order in which they were added, so that all but the last are the parent's. `evidence` is ln of
     the Bayes factor over the first base fit, `score` that less the price of the causes. `rms_m`

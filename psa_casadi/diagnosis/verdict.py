@@ -1,7 +1,7 @@
 """What a diagnosis states of a stack more than of any model: blind spots, rivals, the next record.
 
 What belongs to the sensor or the environment stays out of an exported plant. Where the records
-cannot tell such a cause from one of the plant, which of the two is exported is not theirs to say.
+cannot separate such a cause from one of the plant, they do not determine which one is exported.
 So there are two models, and the difference of their plants' displacements is reported.
 """
 
@@ -79,8 +79,8 @@ def blind_spots(
     return tuple(spots)
 
 
-#: A hold lasts so long [s]; the durations of the largest rises lie in so many bands, each a factor
-#: of four wide, and loops have so many sizes.
+#: What records need: length of a hold [s]; number of bands, each a factor of four wide, with
+#: durations of the largest rises; number of sizes of loops.
 _HOLD, _RATES, _SIZES = 3.0, 2, 3
 
 
@@ -351,7 +351,7 @@ class StackJudge(Judge):
 def patched_model(d: Diagnosis) -> Model:
     """Return the extended model with the unnamed correction fitted with it, all values free.
 
-    Raises InputError where a diagnosis has none, or one that no component stands for;
+    Raises InputError where a diagnosis has none, or one that no component represents;
     SimulationError where it cannot be simulated.
     """
     if d.correction is not None:

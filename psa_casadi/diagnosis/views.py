@@ -17,7 +17,7 @@ BINS, PER_DECADE, FEWEST = 24, 5, 8
 FINE, COARSE = 128, 32
 #: Samples that quantiles are taken from.
 _DRAWN = 20_000
-#: A bin's mean is mentioned beyond so many standard errors.
+#: Number of standard errors beyond which a bin's mean is mentioned.
 _CLEAR = 3.0
 
 
@@ -216,9 +216,9 @@ class Drive:
 
 
 def axes(record: Record, predicted: FloatArray, drive: Drive) -> tuple[Axis, ...]:
-    """Return the axes of a record; `predicted` (n,) [m] stands for the displacement, without noise.
+    """Return the axes of a record; `predicted` (n,) [m] is the displacement's, without noise.
 
-    Against the measured displacement a residual would follow its own noise. Errors of gain and lag
+    Against the measured displacement a residual would follow its noise. Errors of gain and lag
     change sign twice a period: they show if they count along the voltage's deviation or motion.
     """
     t, v = record.time - record.time[0], record.voltage
@@ -271,7 +271,7 @@ def hold_axis(record: Record) -> tuple[Axis, int]:
 
 
 def drive_of(record: Record) -> Drive:
-    """Return turning samples and rate of the voltage, both blind to the voltage's own noise.
+    """Return turning samples and rate of the voltage, both insensitive to the voltage's noise.
 
     The rate is the slope of a running mean, as long as it takes to bring the rate's noise below
     5 % of its mean size.

@@ -1,6 +1,6 @@
 """A stack made linear: feed-forward of the observed hysteresis, and the same tracked online.
 
-The stack is one whose parameters are all 10 % off what the controller was told, and which ages
+All parameters of the stack are 10 % off the values in the controller, and the stack ages
 besides. The observer alone (paper eq. 37) leaves what it does not know; recursive least squares
 (38) learns it from the displacement sensor while the scan runs. Each sample costs a few
 microseconds, and the identification is also exported: as FMU 2.0, FMU 3.0 and Modelica.

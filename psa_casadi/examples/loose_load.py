@@ -1,7 +1,7 @@
 """A load that can lift off the tip of a stack: contact, preload and mass in one component.
 
-The load is pressed on the tip by a constant force and not glued to it, so that it has a position of
-its own. It stays on the tip while the tip withdraws with less than preload / mass, here 300 m/s2.
+A constant force presses the load on the tip; it is not glued, so that its position is a separate
+state. It stays on the tip while the tip withdraws with less than preload / mass, here 300 m/s2.
 """
 
 from pathlib import Path

@@ -1,6 +1,6 @@
-"""A pack for a motor: its model, three effects of its own, and records that hide each of them.
+"""A pack for a motor: its model, three effects for it, and records that hide each of them.
 
-The plants have other laws than the effects: a pull of the teeth that is stronger beside a magnet's
+The plants have other laws than the effects: a pull of the teeth that is stronger near a magnet's
 edge, arcs of a cosine with kinks, and a winding in a case that convection cools.
 """
 
@@ -126,7 +126,7 @@ u = sum(a * np.sin(2 * np.pi * f * t + p) for a, f, p in tones)
 
 
 def magnets(turn: float) -> float:
-    """Return the pull on a tooth, stronger beside a magnet's edge than far from it, in N.m."""
+    """Return the pull on a tooth, stronger near a magnet's edge than far from it, in N.m."""
     s = 10 * turn - 0.7
     return float(-0.012 * np.sin(s) * np.exp(0.5 * (np.cos(s) - 1)))
 

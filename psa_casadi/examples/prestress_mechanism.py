@@ -3,8 +3,8 @@
 The glued stack rings with a damping ratio of 0.03. A mechanism of mass, damper and spring acts as
 feedback around its mechanics (Yang and Zhu 2015, eq. 45): here it is designed for a ratio of 0.7
 and may cost a tenth of the stroke; it costs bandwidth as well. Stack and mechanism then run as two
-FMUs that pass force and motion to each other, and do what the closed form says. The lag's pole
-stays.
+FMUs that pass force and motion to each other, and behave as the closed form predicts. The lag's
+pole stays.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Several motors by a model of their own: a posterior, two side by side, the population of five.
+"""Several motors by a user's model: a posterior, two side by side, the population of five.
 
 `measured` makes the records, with what `model` lacks where that is wanted: dry friction, or the
 voltage that the brushes drop.

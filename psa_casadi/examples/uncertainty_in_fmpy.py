@@ -1,4 +1,4 @@
-"""How sure an FMU is: its own parameter sets played in fmpy, the band of the displacement.
+"""Uncertainty of an FMU: its parameter sets simulated in fmpy, the band of the displacement.
 
 An FMU of an identified model holds sets of its parameters within their uncertainty, as SSV files:
 `mean`, pairs of sigma points, random samples. Any tool that reads SSV can choose one by its name;

@@ -1,7 +1,7 @@
 """An FMU of a stack in CasADi: a step, its sensitivities, an optimal voltage, all on the binary.
 
 CasADi imports the model-exchange side with `DaeBuilder` and differentiates through it by the FMU's
-own directional derivatives. The same problem solved with the symbolic model gives the same voltage.
+directional derivatives. The same problem solved with the symbolic model gives the same voltage.
 """
 
 from itertools import pairwise
@@ -80,7 +80,7 @@ def optimal_voltage(f: ca.Function, model: psa.Model) -> tuple[FloatArray, Float
 
     Backward Euler over 20 steps; states and voltages, each in units of its usual size, are the
     unknowns of IPOPT. The cost is the square of the error in um and a small price on changes of the
-    voltage, and its Hessian stands for the Lagrangian's (Gauss and Newton): an FMU has no second
+    voltage, and its Hessian replaces the Lagrangian's (Gauss and Newton): an FMU has no second
     derivatives.
     """
     size, p, top = model.state_nominals(), model.parameter_vector(), model.values["u_rated"]

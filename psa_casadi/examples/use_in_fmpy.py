@@ -58,7 +58,7 @@ def _expected() -> float:
 
 
 def _run(fmu: Path, voltage: Any, start_values: dict[str, float]) -> Any:
-    """Run the FMU with its own solver; fmpy holds the voltage during each communication step."""
+    """Run the FMU with its solver; fmpy holds the voltage during each communication step."""
     return simulate_fmu(
         str(fmu), fmi_type="CoSimulation", stop_time=END, output_interval=STEP, input=voltage,
         start_values=start_values, output=["displacement"], relative_tolerance=1e-8,

@@ -157,7 +157,7 @@ class Model(Celled):
 
     @property
     def starts_itself(self) -> bool:
-        """Whether it has starts of its own for states or the voltage: a state to begin in."""
+        """Whether it sets starts of states or of the voltage that its components do not declare."""
         return not {"voltage", *self.state_names}.isdisjoint(self.own_starts())
 
     def with_declared_starts(self) -> "Model":

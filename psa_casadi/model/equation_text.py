@@ -28,7 +28,7 @@ from psa_casadi.strict_json import brief
 _ONE = "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p log10 sqrt"
 _ONE += " fabs sign floor ceil erf"
 _TWO = "atan2 fmin fmax fmod remainder copysign hypot"
-#: Functions of the text, which are CasADi's own, and the count of their arguments.
+#: Functions of the text, which are CasADi's, and the count of their arguments.
 FUNCTIONS = {**dict.fromkeys(_ONE.split(), 1), **dict.fromkeys(_TWO.split(), 2), "if_else": 3}
 #: Those that CasADi makes of other operations.
 _COMPOSED = ("log10", "if_else")
@@ -151,7 +151,7 @@ def _tree(operation: str, inputs: list[ast.expr]) -> ast.expr:
 def equations_of(texts: EquationTexts, place: str) -> KeptEquations:
     """Return the equations of a text, functions of the symbols that it names.
 
-    Raises InputError with a sentence for each mistake, which begins with its place in the file.
+    Raises InputError with a sentence for each mistake, which starts with its place in the file.
     """
     problems, reader = Problems(), _Reader()
     expressions: dict[tuple[str, str], Expression] = {}

@@ -1,6 +1,6 @@
 """CasADi expressions as a graph of named operations, which a language writes as text.
 
-CasADi's own operations are reduced to those that people write: `2 x` for its twice, `x^2` for its
+CasADi's operations are reduced to those that people write: `2 x` for its twice, `x^2` for its
 square, `1/x` for its inverse, and one choice for a pair of its conditional zeros.
 """
 

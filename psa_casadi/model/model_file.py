@@ -172,7 +172,7 @@ def no_fmu(used: FmuUsed, name: str, parameters: tuple[Parameter, ...]) -> Compo
 
 
 def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
-    """Read a model; `effects` are own ones that it may have (`own_effects`).
+    """Read a model; `effects` are a user's effects that it may have (`own_effects`).
 
     Raises InputError that names every unknown name, missing or bad value.
     """

@@ -24,7 +24,7 @@ _PAIRS = (
     ("w", "wdef", "intermediate", "expression"),
     ("z", "alg", "algebraic variable", "equation"),
 )
-#: Other names of the same columns, as this package's own functions have them.
+#: Other names of the same columns, as this package's functions have them.
 _ALIASES = {"time": "t", "xdot": "ode"}
 #: What the rows of a column are declared as.
 _KINDS: dict[str, tuple[type, str]] = {
@@ -55,9 +55,9 @@ def ode_model(
 
     It simulates, and it is exported as an FMU and as a Modelica package, like any other model.
 
-    `ode` maps CasADi's own names to symbols and expressions: "x" (nx states), "ode" (nx
+    `ode` maps CasADi's names to symbols and expressions: "x" (nx states), "ode" (nx
     derivatives), and where there are any "u" (nu inputs), "p" (np parameters), "t" (time [s]), "y"
-    (ny outputs; without it every state is shown as NAME_out), "zero" (expressions at whose zeros
+    (ny outputs; without it every state has an output NAME_out), "zero" (expressions at whose zeros
     the derivatives have a kink: the solver looks for them, an FMU has them as events). Or it is a
     CasADi function with these names of inputs and outputs. Symbols are SX or MX, in one column for
     each name.
@@ -78,9 +78,9 @@ def ode_model(
     function of parameters is a number there.
 
     Raises InputError with every mistake: a symbol that is not in x, u, p or t; rows that do not
-    fit; SX beside MX; what cannot be expanded to scalar operations; names used twice or reserved;
-    unknown units; numbers that are not finite; algebraic equations that are not linear in z or
-    leave it open; intermediates that need each other.
+    fit; SX mixed with MX; what cannot be expanded to scalar operations; names used twice or
+    reserved; unknown units; numbers that are not finite; algebraic equations that are not linear in
+    z or leave it open; intermediates that need each other.
     """
     f, names = _read(ode)
     arguments = {"x": states, "u": inputs, "p": parameters, "y": outputs, "w": intermediates}

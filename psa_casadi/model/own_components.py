@@ -150,7 +150,7 @@ def refuse_large(components: Iterable[OwnComponent]) -> None:
 def components_of(file: Mapping[str, OwnComponent], opener: Opener) -> dict[str, Component]:
     """Return the components that a file declares, by name.
 
-    Raises InputError with a sentence for each mistake, which begins with its place in the file.
+    Raises InputError with a sentence for each mistake, which starts with its place in the file.
     """
     refuse_large(file.values())
     problems, components = Problems(), {}

@@ -4,8 +4,8 @@
     psa diagnose record.csv --effects dry_friction
 
 An installed package announces a module with the entry point `psa_casadi.effects`; its effects are
-then in every search. A file never names code to run: MODEL.json tells which module an effect came
-from, and whoever reads it must have named or installed that module.
+then in every search. A file never names code to run: MODEL.json states which module an effect
+came from, and whoever reads it must have named or installed that module.
 """
 
 import hashlib
@@ -39,14 +39,14 @@ def own_effects(module: str) -> Mapping[str, Component]:
 
     It is an installed one, else one of the current folder. The effects are its variables that are a
     `Component` with a gain, or those of its mapping or sequence `EFFECTS` where it has one. Raises
-    InputError where the module cannot be imported, holds none, or holds one that does not fit
-    beside the base model.
+    InputError where the module cannot be imported, holds none, or holds one that does not compose
+    with the base model.
     """
     return _fitting_the_base(declared_effects(module))
 
 
 def declared_effects(module: str) -> Mapping[str, Component]:
-    """Return the effects that a named module holds, whether they fit beside the base or not."""
+    """Return the effects that a named module holds, whether they compose with the base or not."""
     return _effects_of(_imported(module, here=True))
 
 
@@ -57,7 +57,7 @@ def _fitting_the_base(components: Mapping[str, Component]) -> Mapping[str, Compo
 
 
 def misfits(effects: Iterable[Component]) -> list[str]:
-    """Return why effects do not fit beside a stack's base model, a sentence for each fault."""
+    """Return why effects do not compose with a stack's base model, a sentence for each fault."""
     problems: list[str] = []
     for component in effects:
         try:
@@ -120,7 +120,7 @@ def declaration_hash(component: Component) -> str:
 def _installed_only() -> Iterator[None]:
     """Leave the current folder out of where modules come from, as `python -P` does.
 
-    A file that lies there by chance, or that somebody else has put there, stands for no module.
+    A file that lies there by chance, or that somebody else has put there, is not imported.
     """
     before, here = list(sys.path), os.getcwd()
     sys.path[:] = [p for k, p in enumerate(before) if p and not (k == 0 and p == here)]
@@ -140,7 +140,7 @@ def _imported(module: str, *, here: bool = False) -> ModuleType:
             if here and (spec is None or spec.origin is None):  # nothing, or a mere folder
                 sys.path.append(os.getcwd())
             return import_module(module)
-        except Exception as error:  # the user's own code may raise anything
+        except Exception as error:  # the user's code may raise anything
             raise InputError(
                 f"The module '{module}' with own effects cannot be imported"
                 f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"

@@ -1,4 +1,4 @@
-"""The parts that stand around a stack, each a model of its own, and tuned to a given stack."""
+"""The parts around a stack: each is a separate model, tuned to the stack on request."""
 
 from dataclasses import dataclass, replace
 from math import inf, pi
@@ -73,7 +73,7 @@ def part_model(name: str, **values: float) -> Model:
 def compensator_for(
     stack: Model, *, amplifier_gain: float = 1.0, amplifier_bandwidth: float = inf
 ) -> Model:
-    """Return the hysteresis compensator of a stack: its own equation (8) with its own values.
+    """Return the hysteresis compensator of a stack: the stack's equation (8) with its values.
 
     The command is scaled so that `amplifier_gain` [1] times it is the voltage at the stack's input;
     the observer's lag is that of the stack's drive and of an amplifier of `amplifier_bandwidth`

@@ -64,7 +64,7 @@ def true_sum(name: str) -> str:
 
 @in_turn
 def ports_of(model: Model) -> tuple[Port, ...]:
-    """Return the ports of a model: its inputs, the rates of its own physics' states, its outputs.
+    """Return the ports of a model: its inputs, the rates of its base states, its outputs.
 
     And its intermediates. A rate that is nothing but another state (the position's is the
     velocity) is a definition and no physics: it has no port, nor has an intermediate that is
@@ -90,7 +90,7 @@ def ports_of(model: Model) -> tuple[Port, ...]:
 
 
 def parameter_ports(model: Model) -> tuple[Port, ...]:
-    """Return the ports of the parameters of a model's own physics that may be fitted.
+    """Return the ports of the parameters of a model's base physics that may be fitted.
 
     None of an imported FMU, whose parameters are numbers.
     """
@@ -135,7 +135,7 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
 
 
 def kinematics(model: Model) -> dict[str, Mapping[str, float]]:
-    """Return the `kinematic` intermediates of a model's own physics."""
+    """Return the `kinematic` intermediates of a model's base physics."""
     base = [c for c in model.components if c.gain is None]
     return {n: parts for c in base for n, parts in kinematic(c).items()}
 
@@ -171,7 +171,7 @@ def is_place(model: Model, port: Port) -> bool:
 def seen_by(model: Model, port: Port) -> tuple[str, ...]:
     """Return the states, inputs and kinematic intermediates in what a rate or intermediate is.
 
-    A rate sees its own state, too.
+    Those of a rate include its state.
     """
     base, kept = [c for c in model.components if c.gain is None], kinematics(model)
     terms: dict[str, list[Expression]] = {}
@@ -233,9 +233,9 @@ def with_ports(model: Model, ports: Iterable[Port] | None = None) -> Model:
 
 @cache
 def ported(component: Component, ports: frozenset[Port]) -> Component:
-    """Return a component with sums at those of the ports that are its own; once for all.
+    """Return a component with sums at those of the ports that belong to it (cached).
 
-    Those that it has already stay.
+    Sums that it has already stay.
     """
     if isinstance(component.equations, Opened):
         ports, component = ports | {*component.equations.ports}, component.equations.component

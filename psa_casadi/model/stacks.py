@@ -1,7 +1,7 @@
 """Named stacks: a value for every parameter of the base model (cascade), and where it is from.
 
 The paper lists three stacks with rated voltage, stroke and capacitance; its Table 1 is not legible
-in the text at hand. What neither the paper nor a data sheet gives is assumed and says so. How the
+in the text at hand. What neither the paper nor a data sheet gives is marked as assumed. How the
 assumed values hang together:
 
 * Ceramic of density 7.8 g/cm^3 and modulus near 40 GPa in the stack's outline gives mass and
@@ -11,7 +11,7 @@ assumed values hang together:
 * The hysteresis lowers the stroke, so k_L (1/k_P + 1/k_B) is the stroke over 0..u_rated divided
   by the rated voltage and by 0.86, the share that the loop leaves.
 * A/k_L = -0.25 and beta > gamma make x lag u by 12.5 % of the stroke; without delta f_H is bounded:
-  |f_H| <= h_ref (|A| / (beta - gamma))^(1/n). The layering leaves the loops alike (paper, 4.2).
+  |f_H| <= h_ref (|A| / (beta - gamma))^(1/n). The layering does not change the loops (paper, 4.2).
 * delta/k_L = -0.02 1/s widens the loop from 12.5 to 12.6 % of the stroke at 1 Hz, 15 % at 0.1 Hz.
 
 Two more stacks are identified from bundled or public records by `psa identify`. Voltage and
@@ -79,7 +79,7 @@ def _hysteresis(k_L: float, u_rated: float) -> dict[str, Figure]:
 def _identified(
     run: str, values: dict[str, float], undetermined: dict[str, float]
 ) -> dict[str, Figure]:
-    """Return the figures that a fit found; those that the record leaves open count as assumed."""
+    """Return the figures from a fit; those that the record leaves open count as assumed."""
     forces = ("k_L", "A", "beta", "gamma", "delta")
     scale = "; in proportion to the assumed k_P and k_B"
     table = {n: _sourced(v, run + (scale if n in forces else "")) for n, v in values.items()}

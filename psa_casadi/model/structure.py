@@ -22,7 +22,7 @@ from psa_casadi.variables import Input, Output, Parameter, State
 
 
 def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> None:
-    """Symbols share one name space with the balances and time, outputs have one of their own."""
+    """Symbols share one name space with the balances and time, outputs have a separate one."""
     outputs = [o.name for c in components for o in c.outputs]
     problems = Problems()
     for names in (symbols, outputs):
@@ -142,7 +142,7 @@ class Structure:
 
     @cached_property
     def balance_table(self) -> dict[str, Balance]:
-        """The sums that components may add to, by name: those of every model, then its own."""
+        """The sums that components may add to, by name: of every model, then of the components."""
         return _balance_table(self.components)
 
     @cached_property
@@ -271,7 +271,7 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
 
 
 def _balance_table(components: tuple[Component, ...]) -> dict[str, Balance]:
-    """Return the sums of every model, but for names that components declare otherwise, and own."""
+    """Return the sums of every model whose names are no symbols, and those of the components."""
     groups = ("parameters", "states", "sampled", "inputs")
     symbols = {v.name for c in components for kind in groups for v in getattr(c, kind)}
     shared = {n: b for n, b in BALANCES.items() if n not in symbols}

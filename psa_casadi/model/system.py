@@ -183,7 +183,7 @@ def _named(
 class _Wiring:
     """The parts in symbols by their names in the system, and the outputs resolved so far.
 
-    Inputs that are fed from inside have symbols of their own, until they are replaced.
+    Inputs that are fed from inside have temporary symbols until they are replaced.
     """
 
     def __init__(self, parts: Mapping[str, Model], plan: _Plan) -> None:
@@ -194,7 +194,7 @@ class _Wiring:
         self.results = {name: self._renamed(name, model) for name, model in parts.items()}
 
     def _renamed(self, name: str, model: Model) -> list[Expression]:
-        """Return slopes, next values, switches and outputs of a part in its own new symbols."""
+        """Return slopes, next values, switches and outputs of a part in new symbols."""
         s, new = model.structure, [self.symbols["time"]]
         names = [*model.parameter_names, *model.state_names, *model.sampled_names]
         names += model.input_names

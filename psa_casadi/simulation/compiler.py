@@ -100,7 +100,7 @@ def has_zig() -> bool:
 def vector_flags() -> tuple[str, ...]:
     """Return the flags for this processor's vectors; the results have the same bits without them.
 
-    numpy knows which of its own kernels run here.
+    numpy reports which of its kernels run here.
     """
     known = numpy.lib.introspect.opt_func_info(func_name="^multiply$", signature="float64")
     kernels = " ".join(str(k.get("current")) for f in known.values() for k in f.values())
@@ -248,8 +248,8 @@ PRAGMAS = """\
 #endif
 #define CASADI_SYMBOL_EXPORT
 """
-#: From this many numbers on, those of a function in C are in its caller's workspace: as variables
-#: of its own they could take more of the stack than a page, which not every thread has.
+#: From this many numbers on, those of a function in C are in its caller's workspace: as local
+#: variables they could take more of the stack than a page, which not every thread has.
 _MANY = 200
 #: How a library reaches a function that is in another one; see `Foreign`.
 FOREIGN = """\

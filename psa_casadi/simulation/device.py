@@ -177,5 +177,5 @@ def _failures() -> Iterator[None]:
 
 @cache
 def _kernels(cupy: Any, structure: Structure, output: str) -> Any:
-    """Return a model's compiled kernels; CuPy keeps them in its own cache, too."""
+    """Return a model's compiled kernels; CuPy caches them, too."""
     return cupy.RawModule(code=kernel_text(structure, output), options=OPTIONS)

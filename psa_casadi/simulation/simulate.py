@@ -58,7 +58,7 @@ class Way:
 
 @dataclass(frozen=True)
 class Traced:
-    """Outputs (n, m), their derivatives (n, m, k), the way, and all states (n, nx) if asked for."""
+    """Outputs (n, m), their derivatives (n, m, k), the way, and all states (n, nx) if requested."""
 
     y: FloatArray
     sensitivity: FloatArray
@@ -192,7 +192,7 @@ def simulate(
     The model starts in the state that the first voltage and its rate imply, with `memory`
     deviations (see `start_state`). With `as_exported` it starts at its start values instead, as an
     FMU or a Modelica package of it does; a model with start values that differ from its components'
-    (`settled_at`, MODEL.json) does so unless `memory` is given or `as_exported` is False. With
+    (`settled_at`, MODEL.json) does so unless `memory` is set or `as_exported` is False. With
     `from_rest_at_zero` every state starts at 0. Sampled states always start at their start values.
 
     Raises SimulationError, and InputError for samples that do not fit the times or the model.
@@ -283,8 +283,8 @@ def memory_after(
 ) -> dict[str, float]:
     """Return the `memory` (see `simulate`) of a model after a virtual history.
 
-    A stack's hysteresis and creep begin a record where the voltage before it has left them. A
-    model that begins relaxed instead errs by up to half its loop at first, and by all of it at the
+    A stack's hysteresis and creep start a record where the voltage before it has left them. A
+    model that starts relaxed instead errs by up to half its loop at first, and by all of it at the
     end of the range. So the history is played into the same equations:
 
         0 V, relaxed -> V_1 -> V_2 -> ... -> V(0), one sweep each -> rest

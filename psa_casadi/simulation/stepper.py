@@ -119,7 +119,7 @@ def run(
     """Integrate a model over the times `t` (n,) with inputs `u` (n, nu) from `x0` (nx,).
 
     `unknowns` names the parameters of the sensitivities d output / d unknown of the `outputs`, all
-    by default; an integer k stands for the initial value of state k. `s0` (nx, k) is
+    by default; an integer k denotes the initial value of state k. `s0` (nx, k) is
     d x0 / d unknown, zero by default except for the initial values themselves. `steps_limit` bounds
     the work between two samples, `steps_most` that of the whole run; 0 is none.
 

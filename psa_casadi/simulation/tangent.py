@@ -1,4 +1,4 @@
-"""What one more effect adds to a model's outputs, along the model's own trajectory.
+"""What one more effect adds to a model's outputs, along the model's trajectory.
 
 An effect with the gain g and the states z, at the balances b of a model x' = f(x), y = h(x),
 
@@ -218,7 +218,7 @@ class Answer:
     """What an effect makes of the outputs (n, outputs, moved), and the share it may err by.
 
     That is what straight lines between the samples miss of the terms, over their size: a quarter of
-    what lines between every second one miss, and the change of the terms where the effect's own
+    what lines between every second one miss, and the change of the terms where the effect's
     states come from every second one.
     """
 
@@ -301,7 +301,7 @@ def _terms(
 def _own_states(
     law: Law, t: FloatArray, x: FloatArray, u: FloatArray, p: FloatArray, z0: FloatArray
 ) -> FloatArray:
-    """Return an effect's own states (n, nz) along x (nx, n), in which they are 0, and u (nu, n)."""
+    """Return an effect's states (n, nz) along x (nx, n), in which they are 0, and u (nu, n)."""
     n, m, ramps = len(t), len(law.states), np.diff(u) / np.diff(t)
     ends = slice(None, -1), slice(1, None)
     rest = law.rest(n, t[None], x, u, p)

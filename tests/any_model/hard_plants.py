@@ -156,7 +156,7 @@ def battery() -> tuple[psa.Model, Table]:
 
 
 def lorenz() -> Plant:
-    """Chaos of which one state is not shown (Lorenz, J. Atmos. Sci. 20 (1963), 130)."""
+    """Chaos of which one state is not measured (Lorenz, J. Atmos. Sci. 20 (1963), 130)."""
     rng, t = np.random.default_rng(4), 0.01 * np.arange(2000, dtype=np.float64)
     truth = {"s": 10.0, "r": 28.0, "b": 8.0 / 3.0}
 

@@ -1,4 +1,4 @@
-"""Models that are no stacks, before their causes are found: what tests and tables fit."""
+"""Models that are no stacks, without the causes: what tests and tables fit."""
 
 import casadi as ca
 

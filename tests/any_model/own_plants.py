@@ -141,7 +141,7 @@ def cylinder(seed: int) -> list[Signals]:
     """Three records of a hydraulic cylinder whose valve does nothing within 0.6 V.
 
     p' = (Kq w - A v - leak p)/C,  m v' = A p - b v - ks x,  x' = v; w is u less 0.6 V. The noise is
-    0.2 % of each record's own range.
+    0.2 % of each record's range.
     """
     t = np.arange(4000, dtype=np.float64) * 0.005
     tones = ((0.3, 0.7, 1.1, 1.9, 3.1), np.random.default_rng(seed).uniform(0.0, 6.28, 5))

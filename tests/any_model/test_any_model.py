@@ -144,7 +144,7 @@ def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> No
     assert d.causes[0].confidence > 0.95
     assert d.errors[0].base > 15.0 * d.errors[0].extended
     assert d.errors[0].extended == pytest.approx(8e-6, rel=0.06)  # the noise
-    # the plant's own numbers, through an effect of other coordinates
+    # the plant's parameters, through an effect of other coordinates
     assert d.model.values["m"] == pytest.approx(2.0, rel=0.01)
     assert d.model.values["k"] == pytest.approx(5e4, rel=0.01)
     per_m = d.model.values["hysteresis_of_x_in_v_size"]
@@ -248,7 +248,7 @@ def test_an_oscillator_is_sampled_and_compared(
 def test_dry_friction_of_a_motor_is_found_at_its_shaft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The program of the page, whose plant has its own equations."""
+    """The program of the page, whose plant has separate equations."""
     monkeypatch.chdir(tmp_path)
     first, intermediates, effect = blocks_in_tests("docs/howto/own_model.md")
     names: dict[str, Any] = {}

@@ -36,7 +36,7 @@ def test_a_force_between_two_bodies_is_named_at_the_force_with_its_values() -> N
 
 
 def test_the_places_of_intermediates() -> None:
-    """A definition has no port, and what only adds to one rate is no place beside that rate."""
+    """A definition has no port, and what only adds to one rate has none besides that rate's."""
     model = hard.two_bodies()
     ports = {p.variable: p for p in ports_of(model)}
     assert {n for n, p in ports.items() if p.kind == "intermediate"} == {"spring", "held"}
@@ -92,7 +92,7 @@ def test_a_law_that_no_effect_of_the_table_has_is_told_as_a_formula(tmp_path: Pa
 
 
 def test_a_rate_that_is_an_input_or_a_flow() -> None:
-    """An input is a definition, with ports beside it or not; a flow is physics."""
+    """A rate that is an input is a definition, in the model with ports too; a flow is physics."""
     x, y, u, flow = (ca.SX.sym(n) for n in ("x", "y", "u", "flow"))
     model = psa.ode_model(
         {"x": [x, y], "u": u, "w": flow, "wdef": u * x - y, "ode": [u, flow]}, name="filled"

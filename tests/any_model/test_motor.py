@@ -1,4 +1,4 @@
-"""The example of a pack for a motor, asked about plants with other laws."""
+"""The example of a pack for a motor, applied to plants with other laws."""
 
 from pathlib import Path
 

@@ -13,7 +13,7 @@ from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.units import FloatArray
 
-#: Noise of two outputs in units of their own, and what each of two causes adds to them.
+#: Noise of two outputs, each in its unit, and what each of two causes adds to them.
 NOISE = np.array([2e-6, 0.3])
 ONE, OTHER = NOISE * [2.0, 3.0], NOISE * [1.0, 4.0]
 #: Of all that is above the noise (4 + 9 + 1 + 16), what the first cause makes.

@@ -1,4 +1,4 @@
-"""Records of a model of one's own in files and tables, in other units than the model's."""
+"""Records of a user's model in files and tables, in other units than the model's."""
 
 import json
 import re
@@ -61,7 +61,7 @@ def _csv(path: Path) -> Path:
 
 
 def _german(path: Path) -> Path:
-    """With a mark of UTF-8, a preamble, units in a row of their own, and decimal commas."""
+    """With a mark of UTF-8, a preamble, units in a separate row, and decimal commas."""
     head = "Prüfstand 3;;\r\n\r\nZeit;valve;flow;speed;Oil temp;remark\r\n"
     head += "[ms];[%];[l/min];[rpm];[degC];[V]\r\n"
     path.write_bytes(b"\xef\xbb\xbf" + (head + _rows(";", ",", "\r\n")).encode())

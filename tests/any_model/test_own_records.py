@@ -1,4 +1,4 @@
-"""Records of models that are no stacks: their own noise, held inputs, what is refused."""
+"""Records of models that are no stacks: their noise, held inputs, what is refused."""
 
 from dataclasses import replace
 

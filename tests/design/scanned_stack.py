@@ -107,9 +107,9 @@ _SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
 
 
 def bang_bang_move(model: psa.Model, found: QuickMove) -> float | None:
-    """Return the length [s] of the stack's own bang-bang move that a design leads to.
+    """Return the length [s] of the stack's bang-bang move that a design leads to.
 
-    Between the limits, from the rest in which the design begins, of which x has crept; the search
+    Between the limits, from the rest in which the design starts, of which x has crept; the search
     starts from the arcs of the design's voltage. None if it does not settle.
     """
     first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
@@ -191,7 +191,7 @@ def scan(model: psa.Model, samples: int) -> Target:
 def rounded_triangle(phase: FloatArray, turn: float) -> FloatArray:
     """Return a triangle of period 1 from 0 to 1 and back whose turns take the share `turn`.
 
-    Over that share of each half period the acceleration is a half sine; it begins at rest.
+    Over that share of each half period the acceleration is a half sine; it starts at rest.
     """
     s = 1.0 - np.abs(1.0 - 2.0 * np.mod(phase, 1.0))  # way along the half period, 0 to 1
     half = 0.5 * turn

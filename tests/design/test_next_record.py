@@ -1,4 +1,4 @@
-"""The next record of any model: within its limits, as telling as it says, for two inputs too."""
+"""The next record of any model: within its limits, informative as predicted, for two inputs too."""
 
 import math
 from functools import cache

@@ -1,4 +1,4 @@
-"""Effects that records cannot tell apart but by a form nobody knows stay together in a set."""
+"""Effects that records separate only by a form that nobody knows stay together in a set."""
 
 from pathlib import Path
 
@@ -44,7 +44,7 @@ def test_bends_are_alike_where_no_resonance_shows(
 
 @slow
 def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
-    """Its own entry is in the table; an arc tangent is no polynomial."""
+    """The bend's entry is in the table; an arc tangent is no polynomial."""
     path = tmp_path / "a.csv"
     make_record("sensor_nonlinearity", 1, path, visible=(2.0, 2.5))
     record = read_record(path).slice(0, 3000)

@@ -49,7 +49,7 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
 
 @slow
 def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
-    """1.69 kHz sampled at 2 kHz, seen at 0.33 kHz, where it decays as fast in time."""
+    """1.69 kHz sampled at 2 kHz, aliased to 0.33 kHz, where it decays as fast in time."""
     make_record(None, 19, tmp_path / "a.csv", excitation="short")
     result = diagnose([read_record(tmp_path / "a.csv")], effects=[EFFECTS["structural_mode"]])
     assert result.verdict == "adequate"
@@ -57,7 +57,7 @@ def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Pa
 
 @slow
 def test_a_missed_resonance_is_no_cause(tmp_path: Path) -> None:
-    """Before its ringing was sought, this clean record was said to be unexplained."""
+    """Without a search for its ringing, this clean record has the verdict unexplained."""
     make_record(None, 118254, tmp_path / "a.csv", noise="ar")
     effects = [EFFECTS[n] for n in ("structural_mode", "sensor_delay", "sensor_lag", "drive_lag")]
     assert diagnose([read_record(tmp_path / "a.csv")], effects=effects).verdict == "adequate"

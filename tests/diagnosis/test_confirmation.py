@@ -1,4 +1,4 @@
-"""Where held-out samples cannot confirm a cause, none is named, and the sentence says why."""
+"""Where held-out samples cannot confirm a cause, none is named, and the sentence states why."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Unnamed corrections find their own kind and port, keep silent on noise, and weigh on names."""
+"""Unnamed corrections find the right kind and port, keep silent on noise, and weigh on names."""
 
 from collections.abc import Callable
 

@@ -76,7 +76,7 @@ def test_a_displacement_in_another_unit_is_told(factor: float, displacement: Flo
 
 
 def _modes() -> Record:
-    """Five light modes of either sign behind a delay, sampled too slowly for a stack's own."""
+    """Five light modes of either sign behind a delay, sampled too slowly for a stack's modes."""
     time: FloatArray = np.arange(2000) / 500.0
     voltage = 50.0 + 20.0 * np.sin(2 * np.pi * (2.0 * time + 18.5 * time**2))
     y = np.zeros(time.size)

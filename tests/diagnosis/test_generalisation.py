@@ -1,4 +1,4 @@
-"""A model that holds only where it was fitted, and what a diagnosis says of it."""
+"""A model that holds only where it was fitted, and what a diagnosis reports of it."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ TIME = np.linspace(0.0, 1e-3 * (SAMPLES - 1), SAMPLES)
 
 @pytest.fixture(scope="module")
 def fitted() -> tuple[Fit, FloatArray, FloatArray]:
-    """A fit, the voltage it saw [V], and the displacement it says [m]."""
+    """A fit, its voltage [V], and the displacement without noise [m]."""
     voltage: FloatArray = 40.0 * (1.0 - np.cos(2 * np.pi * 4.0 * TIME))
     model = compose(BASE)
     clean = simulate(model, TIME, voltage).displacement
@@ -46,7 +46,7 @@ def _own(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnCo
 
 
 def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
-    """What is said of an error (n,) [m] of that model."""
+    """The excess that is reported for an error (n,) [m] of that model."""
     result, voltage, clean = fitted
     experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
     used = error[experiments[0].used]
@@ -85,7 +85,7 @@ def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
 def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
 ) -> None:
-    """Its offset is found in a tenth of it; its noise is three times that of the fitted one."""
+    """A tenth of it determines its offset; its noise is three times that of the fitted one."""
     result, voltage, clean = fitted
     rng = np.random.default_rng(3)
     items = []

@@ -15,7 +15,7 @@ from tests.tiers import slow
 
 @slow
 def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
-    ends = (1000, 1000)  # their lengths tell nothing either
+    ends = (1000, 1000)  # their lengths hold no information either
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
     pairs = zip(("a", "b"), ends, strict=True)

@@ -1,4 +1,4 @@
-"""Rows of docs/evidence.md on the measured micromanipulator are what a diagnosis says of it.
+"""Rows of docs/evidence.md on the measured micromanipulator are what a diagnosis reports.
 
 Those of the sine, which is the README's picture, and of the minor loops, which the README
 diagnoses; `python -m tests.studies measured` has the others, which take a minute each.

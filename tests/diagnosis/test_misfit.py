@@ -1,4 +1,4 @@
-"""What is seen in a residual: what was put in, and nothing in noise; its lines and harmonics."""
+"""What a residual reveals: what was put in, and nothing in noise; its lines and harmonics."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Noise with a colour: its level from a residual's fast part, and a cause named beside it."""
+"""Noise with a colour: its level from a residual's fast part, and a cause named in its presence."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,7 @@ NOISES = [_pink, _telegraph, _walk, _jitter]
 def test_noise_of_any_colour_is_noise(
     number: int, made: Callable[[FloatArray, np.random.Generator], FloatArray], tmp_path: Path
 ) -> None:
-    """Three times as large as the white noise beside it."""
+    """Three times as large as the white noise in the record."""
     path, rng = tmp_path / "clean.csv", np.random.default_rng(number)
     make_record(None, 4430 + number, path)
     time, voltage, displayed = np.loadtxt(path, delimiter=",", skiprows=1).T

@@ -1,4 +1,4 @@
-"""What has changed since a reference is named beside another hysteresis, and nothing else is."""
+"""What has changed since a reference is named despite another hysteresis, and nothing else is."""
 
 from dataclasses import replace
 from typing import Any
@@ -51,7 +51,7 @@ def test_an_effect_is_named_beside_a_hysteresis_that_the_base_lacks() -> None:
     d = psa.diagnose(new, reference=good)
     assert [c.effect for c in d.causes] == ["slow_creep"]
     assert codes(d)["since"].values["places"] == 1
-    # what was added is a plant's, not ours: it is found in size as well
+    # the plant's form, not the package's, was added: its size is recovered as well
     more = 1e-6 * (play(CREEPS).clean - play(replace(CREEPS, hidden={})).clean)
     left = measured(d.experiments[0].record) - d.base[0]
     assert np.corrcoef(more, left)[0, 1] > 0.9

@@ -1,4 +1,4 @@
-"""The signature of an effect: told along a coordinate that physics gives, for every effect."""
+"""The signature of an effect: reported along the coordinate that physics implies, for each."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from psa_casadi.diagnosis.signature import signature
 from psa_casadi.effects import EFFECTS
 from tests.contract.helpers import refused
 
-#: Coordinates along which physics says that an effect is to be seen.
+#: Coordinates along which an effect shows by its physics.
 TOLD = {
     "slow_creep": {"holds"},
     "hysteresis_memory": {"from_reversal"},

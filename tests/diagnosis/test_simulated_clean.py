@@ -1,4 +1,4 @@
-"""The package's own simulations are adequate: nothing is missing, and nothing is said to be.
+"""The package's simulations are adequate: nothing is missing, and nothing is reported to be.
 
 Every named stack, driven by a sine, a triangle, a multisine and steps, without noise, rounded to
 1 nm as a file may be, and with white noise from 1e-5 to 1e-3 of the range; and a displacement of
@@ -111,7 +111,7 @@ def test_what_can_be_known_holds_rounding_error_and_form() -> None:
 
 
 def test_what_a_first_loop_leaves_behind_is_no_noise() -> None:
-    """Repeats of a triangle that begins at rest differ by the first loop and by creep."""
+    """Repeats of a triangle that starts at rest differ by the first loop and by creep."""
     record = record_of(Case("demo", "triangle", "1e-4"))
     assert record.displacement is not None
     level = 1e-4 * float(np.ptp(record.displacement))

@@ -85,7 +85,7 @@ def with_two_modes() -> psa.Model:
 def test_its_equations_are_those_of_modal_superposition() -> None:
     model, time = with_two_modes(), np.arange(4000) / 20_000.0
     voltage = multisine(time, 0.0, 80.0, (20.0, 1500.0), seed=3)
-    voltage *= np.clip((time - 0.002) / 0.01, 0.0, 1.0)  # it begins at rest
+    voltage *= np.clip((time - 0.002) / 0.01, 0.0, 1.0)  # it starts at rest
     base = psa.simulate(psa.stack_model("P-885.51"), time, voltage, rtol=1e-6)
     extended = psa.simulate(model, time, voltage, rtol=1e-6)
     k = model.values
@@ -147,7 +147,7 @@ C_P = STACK.values["C_p"]
 
 
 def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> Record:
-    """A record of the independent reference, whose current has noise and a zero of its own."""
+    """A record of the independent reference, whose current has a separate noise and zero."""
     rng = np.random.default_rng(3)
     t = step * np.arange(1500.0)
     phases = rng.uniform(0.0, 6.28, len(tones))

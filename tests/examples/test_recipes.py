@@ -33,7 +33,7 @@ _FOLDER = tempfile.TemporaryDirectory()
 def run_command(command: str) -> None:
     """Run a command of `psa` in the current folder, for the platform of this machine only.
 
-    What binaries of other platforms do is shown by tests/export/test_fmu_platforms.py.
+    What binaries of other platforms do is tested by tests/export/test_fmu_platforms.py.
     """
     words = shlex.split(command)
     assert words[0] == "psa"
@@ -236,7 +236,7 @@ def test_the_shell_commands_of_fmpy(made: Path, monkeypatch: pytest.MonkeyPatch)
 def test_the_jobs_of_ci_are_yaml_and_their_commands_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """GitHub's own actions excepted, and what the installation depends on."""
+    """GitHub's actions excepted, and what the installation depends on."""
     (job,) = yaml.safe_load(_script("ci", "fmu.yml").text)["jobs"].values()
     assert job["runs-on"] == "ubuntu-latest"
     actions = [step["uses"] for step in job["steps"] if "uses" in step]

@@ -53,7 +53,7 @@ CONTROLLER = psa.Component(
     ),
 )
 
-#: A controller of its own: its measurement is an input, and it has no continuous state.
+#: A controller without a plant: its measurement is an input, and it has no continuous state.
 ALONE = psa.Component(
     name="controller",
     description="sampled PI controller with a direct part",

@@ -227,7 +227,7 @@ def test_sensitivities_are_differences_of_runs(effect: psa.Component) -> None:
     rtol = 1e-9 if effect.name == "rate_dependent_hysteresis" else 1e-8
     exact = psa.run(model, t, u, start, rtol=rtol, unknowns=unknowns).sensitivity[:, -1]
     for column, name in enumerate(unknowns):
-        # a tone turns many times; a small gain would drown in the stepper's own error
+        # a tone turns many times; a small gain would drown in the stepper's error
         share = 3e-6 if name == effect.tone else 3e-2 if name == effect.gain else 3e-4
         step = share * model.parameter(name).typical(model.values)
         moved = [{**model.values, name: model.values[name] + h} for h in (step, -step)]

@@ -116,7 +116,7 @@ def edited(change: Callable[[dict[str, Any]], object]) -> str:
 
 
 def refused(change: Callable[[dict[str, Any]], object]) -> str:
-    """Return the problems of a changed file, each of which begins with its name."""
+    """Return the problems of a changed file, each of which starts with its name."""
     problems = sentences(lambda: loads(edited(change), "m.json"))
     assert all(line.startswith("m.json") for line in problems)
     return "\n".join(problems)

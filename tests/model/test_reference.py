@@ -227,7 +227,7 @@ def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
     return p
 
 
-#: Every stack with one voltage of its own, and every voltage.
+#: Every stack with one voltage, another one for each, and every voltage.
 ONCE = [(s, "cascade", d) for s, d in zip(sorted(psa.STACKS), DRIVES, strict=True)]
 ONCE += [("P-885.51", "single_mass", DRIVES[0])]
 AGREEMENTS = [*ONCE, *(("WYDS0808020", "single_mass", drive) for drive in DRIVES[1:])]

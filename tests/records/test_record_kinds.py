@@ -255,7 +255,7 @@ def test_dates_of_files_to_be_joined_are_on_one_clock(tmp_path: Path) -> None:
         return [f"2024-03-05 14:11:02.{round(1e6 * (t + late)):06d}" for t in T]
 
     drive = table("Timestamp,U [V]", columns=(stamped(0.0), V))
-    sensor = table("Timestamp,x [um]", columns=(stamped(2e-3), X))  # begins five samples later
+    sensor = table("Timestamp,x [um]", columns=(stamped(2e-3), X))  # starts five samples later
     paths = [written(tmp_path, drive, "v.csv"), written(tmp_path, sensor, "x.csv")]
     (record,) = read_records(paths)
     is_read(record, t=T[5:], v=V[5:], x=X[:-5])

@@ -70,7 +70,7 @@ class Browser:
 
 
 def without_policy(text: str) -> str:
-    """Return a page that lets scripts in which are not its own: those of a test."""
+    """Return a page that lets foreign scripts in: those of a test."""
     return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
 
 
@@ -79,7 +79,7 @@ def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool 
 
     Where it is to be `silent`, a word on the console fails the test.
     """
-    copy = page.with_name(f"{page.stem}-driven.html")  # beside it: its links are relative
+    copy = page.with_name(f"{page.stem}-driven.html")  # in the same folder: its links are relative
     call = (
         "<pre id='driven'></pre><script>function tell(found) {"
         " document.getElementById('driven').textContent = JSON.stringify(found); }\n"

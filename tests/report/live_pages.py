@@ -23,7 +23,7 @@ def library(name: str) -> str:
 def case(
     model: Model, time: FloatArray, voltage: FloatArray, *, rtol: float | None = 1e-6, **more: Any
 ) -> dict[str, Any]:
-    """Return what a page is asked for: the model's values on a voltage."""
+    """Return a request to a page: the model's values on a voltage."""
     return {
         "values": model.parameter_vector().tolist(),
         "nominals": model.state_nominals().tolist(),
@@ -35,9 +35,9 @@ def case(
 def run_in_browser(
     browser: Browser, model: Model, cases: Sequence[Mapping[str, Any]], *, times: int = 0
 ) -> list[dict[str, Any]]:
-    """Return status, way, steps and shown displacement (n,) [m] of every case of one module.
+    """Return status, way, steps and displayed displacement (n,) [m] of every case of one module.
 
-    Each is run so many `times` more, and `spent` is what one takes then [ms].
+    Each is run `times` more, and `spent` is what one takes then [ms].
     """
     table = {"model": live_data(model, web_module(model)), "cases": list(cases), "times": times}
     page = browser.folder / "module.html"

@@ -86,7 +86,7 @@ def _fit(model: psa.Model, records: int) -> Fit:
 def diagnosis(
     verdict: result.Verdict, names: tuple[str, ...] = ("plant_a",), samples: int = 1500
 ) -> result.StackDiagnosis:
-    """Return a diagnosis with the given verdict on the named records."""
+    """Return a diagnosis with this verdict on the named records."""
     added = verdict in ADDED
     parts = [experiment(n, samples) for n in names]
     base = tuple(p[1] for p in parts)

@@ -24,11 +24,11 @@ _AS_3_AND_4 = (
 
 
 class RefusedError(Exception):
-    """The browser does not do what it is asked for, as where a page has just gone."""
+    """The browser does not do what is requested, as where a page has just gone."""
 
 
 class Steered:
-    """One tab; `heard` are the events that it has told: requests, words on the console."""
+    """One tab; `heard` are the events that it has reported: requests, words on the console."""
 
     def __init__(self, read: int, write: int) -> None:
         self._read, self._write, self._rest, self._count = read, write, b"", 0
@@ -63,7 +63,7 @@ class Steered:
         return table
 
     def run(self, script: str) -> Any:
-        """Return what an expression is worth in the page."""
+        """Return the value of an expression in the page."""
         result = self.call("Runtime.evaluate", expression=script, returnByValue=True)
         assert "exceptionDetails" not in result, result
         return result["result"].get("value")

@@ -1,6 +1,6 @@
 """No page keeps people out who cannot see it well or have no mouse: axe finds no serious fault.
 
-The pages of the site are looked at where PSA_CASADI_SITE says they were built, as
+The pages of the site are checked in the folder that PSA_CASADI_SITE names, as
 `build_scripts/check docs` does.
 """
 

@@ -164,7 +164,7 @@ def test_names_are_text_and_no_foreign_script_runs(
     assert "<title>taken" not in document
     assert len(console) == 1
     assert "Content Security Policy" in console[0]
-    assert 'class="knob' in document  # the page's own scripts did
+    assert 'class="knob' in document  # the page's scripts did
 
 
 @slow

@@ -54,7 +54,7 @@ def colours(image: np.ndarray[tuple[int, int, int], np.dtype[np.float64]]) -> in
 def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: Path) -> None:
     document, console = browser.document(page, "--window-size=1280,900")
     assert console == []
-    assert '<html lang="en" class="scripted">' in document  # no still picture is seen
+    assert '<html lang="en" class="scripted">' in document  # no still picture is visible
     boxes = document.split('class="drawing')[1:]
     assert len(boxes) == len(re.findall('class="drawing', page.read_text(encoding="utf-8")))
     assert len(boxes) >= 14

@@ -185,7 +185,7 @@ def full_folder(path: Path) -> None:
 
 
 def other_library(path: Path) -> None:
-    """With its own checksum, as if the files had been renamed."""
+    """With its checksum, as if the files had been renamed."""
     other = library(7)
     rewrite(path, other.read_bytes())
     rewrite(checksum(path), checksum(other).read_bytes())

@@ -96,7 +96,7 @@ def test_every_stack_and_voltage_agrees_with_the_stepper(turn: int) -> None:
         share = np.linspace(0.0, 1.0, SAMPLES)
         model = with_effect(NAMES[turn], stack_name)
         result, way = compare(model, times(SAMPLES, step), voltage(kind, share))
-        # where the stepper was taken it may err by what its own 0.0005 rtol a step adds up to
+        # where the stepper was taken it may err by what its 0.0005 rtol a step adds up to
         assert result <= (RTOL if way == EXACT else 3 * RTOL), (stack_name, kind, step)
         ways.append(way)
     stepped_ones = 2 if NAMES[turn] == "rate_dependent_hysteresis" else 1
@@ -207,7 +207,7 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
 
 
 def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
-    """At the demonstration's kinks steps that were halved once where they err by far missed it."""
+    """At the demonstration's kinks, halving a step once where it errs by far is not enough."""
     with resources.as_file(resources.files("psa_casadi").joinpath("data", "demo.csv")) as path:
         record = read_record(path)
     model, t = starting_model([record]), np.asarray(record.time - record.time[0])
@@ -283,7 +283,7 @@ def _clear() -> None:
 
 @pytest.fixture
 def _plain_vectors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Compile without this processor's vectors, in libraries of their own."""
+    """Compile without this processor's vectors, in separate libraries."""
     _clear()
     monkeypatch.setattr(exact, "vector_flags", lambda: ())
     yield

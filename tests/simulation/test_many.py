@@ -101,7 +101,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> HostCuda:
 def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
     """Nine sets in batches, whole rows and what is kept of them; squares are summed otherwise.
 
-    The matrices' ladder is a thread's own.
+    Each thread holds the matrices' ladder.
     """
     model, one = stack("P-885.51"), record()
     values = sets(model, 9)
@@ -138,7 +138,7 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
 
 @slow
 def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
-    """The matrices' ladder is too large for a thread's own memory."""
+    """The matrices' ladder is too large for the memory of a thread."""
     model = stack("P-885.51").with_effect(EFFECTS["load_stiffness"], {"load_gain": 0.02})
     values = sets(model, 3)
     rows = simulate_many(model, values, record())

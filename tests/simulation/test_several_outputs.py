@@ -43,7 +43,7 @@ CASES = {"motor": _motor, "stack": _stack}
 
 
 def _traced(case: Case, outputs: tuple[str, ...], hold: str, *, stepped: bool) -> Traced:
-    """Run without `s0`: columns of initial states are one at their own state."""
+    """Run without `s0`: columns of initial states are one at their state."""
     model, _, unknowns, t, u, x0 = case
     way = Way(1e-8, 1e-10, stepped=stepped)
     return trace(model, t, u, x0, way=way, outputs=outputs, unknowns=unknowns, hold=hold)
@@ -100,7 +100,7 @@ def test_columns_are_differences_of_runs(stepped: bool) -> None:
 
 
 FORCE = ca.SX.sym("f")
-#: Of a force in [-1, 1]: a corner behind a dead zone, jumps, and one beside a straight part.
+#: Of a force in [-1, 1]: a corner behind a dead zone, jumps, and one next to a straight part.
 BY_INPUT = {
     "dead zone": ca.sign(FORCE) * ca.fmax(ca.fabs(FORCE) - 0.3, 0.0),
     "branch": ca.if_else(FORCE > 0.3, FORCE - 0.3, 0.0),

@@ -95,7 +95,7 @@ def test_a_pattern_of_names_that_no_case_has_is_told() -> None:
 
 @slow
 def test_all_ways_reach_the_error_on_a_short_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Eight sets of 40 samples of a sine, scipy and CVODES beside `simulate_many`."""
+    """Eight sets of 40 samples of a sine, scipy and CVODES next to `simulate_many`."""
     none = Mock(side_effect=psa.InputError("there is none."))
     monkeypatch.setattr(device, "device_module", none)
     monkeypatch.setattr(peers, "find_spec", lambda _: None)
@@ -128,7 +128,7 @@ RESULTS = [
     _result("known", "slow_creep", {"slow_creep": 0.97, "offset_drift": 0.03}),
     _result("known", "slow_creep", {"slow_creep": 0.99}),
     _result("known", "offset_drift", {"slow_creep": 0.9, "offset_drift": 0.1}),
-    _result("known", "offset_drift", {"slow_creep": 0.99}, 0.01),  # not as visible as asked for
+    _result("known", "offset_drift", {"slow_creep": 0.99}, 0.01),  # not as visible as requested
     _result("left out", "slow_creep", {"offset_drift": 0.98}),
     _result("foreign", "dry_friction", {}),
     _result("clean", None, {}),
@@ -297,7 +297,7 @@ def structure(softer: float = -0.03) -> mirror.Modes:
 def response_of(modes: mirror.Modes, frequency: FloatArray, amplitude: float) -> ComplexArray:
     """Return displacement over voltage (lines, 3, 3) [m/V] of voltages held between samples."""
     above, whole = amplitude - mirror.MIDDLE, np.zeros((len(frequency), 3, 3), dtype=np.complex128)
-    for n in range(-20, 21):  # what steps drive beside the line itself, and samples show as it
+    for n in range(-20, 21):  # what steps drive besides the line, and sampling aliases to it
         s = 2j * np.pi * (frequency + n * mirror.RATE)
         table = np.tile(modes.rest.astype(np.complex128), (len(s), 1, 1))
         for m in modes.modes:

@@ -107,7 +107,7 @@ def test_the_score_of_answers_made_by_hand_is_as_counted(data: Path) -> None:
     assert {k: matches[k] for k in expected} == expected
     assert matches["held-out error over the noise, median"] == pytest.approx(1.0)
     assert matches["the fitted base's, median"] == pytest.approx(np.sqrt(5.0))
-    # half of an effect of power 4 is left: a power of 1 beside the noise
+    # half of an effect of power 4 is left: a power of 1 besides the noise
     assert matches["foreign: share of the excess removed, median"] == pytest.approx(0.75)
     # 0; 0.25 + 0.25; 0.36 + 0.36; 0; and 2 for the weak one that has no answer
     assert matches["Brier score"] == pytest.approx((0.0 + 0.5 + 0.72 + 0.0 + 2.0) / 5)

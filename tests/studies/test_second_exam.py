@@ -1,4 +1,4 @@
-"""The second exam: its plants are what its table says."""
+"""The second exam: its plants agree with its table."""
 
 from pathlib import Path
 

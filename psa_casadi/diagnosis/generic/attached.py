@@ -1,4 +1,4 @@
-"""An effect with the ports that it needs, and the parameters that most effects have alike."""
+"""An effect with the ports that it needs, and the parameters that most effects share."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -35,9 +35,9 @@ _DOES: dict[str, Kind] = {
 }  # fmt: skip
 #: Returns a parameter or a state of an effect by its short name.
 SymbolOf = Callable[[str], Expression]
-#: The derivatives of an effect's own states, by short name, and its term.
+#: The derivatives of an effect's states, by short name, and its term.
 Terms = tuple[dict[str, Expression], Expression]
-#: The equations of an effect: (symbols, its own by short name) -> term, or both.
+#: The equations of an effect: (symbols, the effect's by short name) -> term, or both.
 Law = Callable[[Symbols, SymbolOf], Terms | Expression]
 
 
@@ -77,9 +77,9 @@ def at_port(
 ) -> Attached:
     """Return an effect that adds a term to a port's sum.
 
-    Parameters and states have short names here, before which the effect's stands in the model. A
+    Parameters and states have short names here; in the model the effect's name precedes them. A
     parameter `angle` is tried at `ANGLES`. `words` are description, source, equation and what it
-    looks like; in the equation, Q stands for the port's sum and q for the `signal`.
+    looks like; in the equation, Q denotes the port's sum and q the `signal`.
     """
 
     def equations(s: Symbols) -> Equations:

@@ -28,14 +28,14 @@ from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.units import rate_unit
 from psa_casadi.variables import Parameter, State
 
-#: Ordinary sizes at which a memory is looked for: the derivative at 0 tells little of one that acts
-#: in full.
+#: Ordinary sizes at which a memory is looked for: the derivative at 0 holds little information on
+#: one that acts in full.
 _IN_FULL = (0.0, 2.0, -2.0)
 #: A rate below this share of its size has no direction.
 _STILL = 1e-3
 #: Stiffest stop, over the largest rate at one range beyond it; width of its corner over the range.
 _STIFF, _CORNER = 1e4, 0.005
-#: A parameter changes by this share of its value as a rule, and by so many times it at most.
+#: Usual and largest change of a parameter over its value.
 _CHANGES, _MOST = 0.1, 5.0
 
 
@@ -68,7 +68,7 @@ class _Sum:
 def sum_effects(model: Model, port: ports.Port, sizes: Sizes) -> tuple[Attached, ...]:
     """Return what may be missing in the rate of a state, or in an intermediate.
 
-    Of an intermediate, what is no coordinate may be lost by; a rate is lost by its own state.
+    Losses in an intermediate depend on variables that are no coordinates, in a rate on its state.
     """
     at = _Sum(model, port, sizes)
     rate = [port.variable] if port.kind == "rate" else []
@@ -215,7 +215,7 @@ def _stop(at: _Sum, x: str) -> Attached:
 def _hysteresis(at: _Sum, x: str) -> Attached:
     """Bouc and Wen's element along a state: z' = w (1 - bend |r|^n) - loss |w| sgn(r) |r|^n.
 
-    w = x'/range and r = z, so that the loop's own way is one range where loss and bend are 1.
+    w = x'/range and r = z, so that the loop's way is one range where loss and bend are 1.
     """
     (parts, reads), force = _way(at.model, x), at.largest
 

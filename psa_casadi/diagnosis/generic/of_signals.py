@@ -1,7 +1,7 @@
 """What may be missing between a signal and the model: at an input (drive) or an output (sensor).
 
 Or within it, at an intermediate. Every effect adds to the port's sum what makes the signal q
-another one; q is the input as given, the output before its sensor, the intermediate by its
+another one; q is the input of the model, the output before its sensor, the intermediate by its
 equation.
 """
 
@@ -43,7 +43,7 @@ ANGLE = Parameter(
 )  # fmt: skip
 #: What a signal belongs to.
 _PLACE = {"input": "drive", "output": "sensor", "intermediate": "plant"}
-#: As `Law`, with the signal's value: (symbols, signal, its own by short name) -> term, or both.
+#: As `Law`, with the signal's value: (symbols, signal, effect's by short name) -> term, or both.
 _Law = Callable[[Symbols, Expression, SymbolOf], Terms | Expression]
 
 

@@ -24,16 +24,17 @@ from psa_casadi.simulation.timings import Work, counted, stage
 
 #: Hypotheses whose neighbours are fitted, at most, and visits to them.
 _EXPANSIONS, _VISITS = 5, 24
-#: Where a neighbour's residual is within this factor of the noise, none needs fits from default
-#: values; else of a first and a further cause so many get some. The noise is estimated too low by
-#: what was projected out of it: 1.7 % where 132 directions were taken out of 3,900 samples.
+#: Factor to the noise within which a neighbour's residual makes fits from default values needless;
+#: else number of neighbours that get them, of a first and of a further cause. The noise is
+#: estimated too low by what was projected out of it: 1.7 % where 132 directions were taken out of
+#: 3,900 samples.
 _SETTLED, _AFRESH, _AFRESH_FURTHER = 1.03, 5, 2
 #: Causes that could not be named with this probability are small.
 _SURELY = 0.9
 #: A hypothesis is looked at again when its rms falls to this share; a resonance near the band is
 #: tried where its ringing explains this share of what the best effect would.
 _BETTER, _RINGING = 0.95, 0.4
-#: So many neighbours are fitted first.
+#: Number of neighbours that are fitted first.
 _PACE = 2
 
 
@@ -140,7 +141,7 @@ class _Search:
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
 
-        Beside a large one that is missing they can hardly confirm a small one.
+        While a large one is missing, they can hardly confirm a small one.
         """
         if not self.does("rejected"):
             return None
@@ -298,7 +299,7 @@ class _Search:
             self.known.remember(root, result.causes[-1].name)
 
     def challenge(self, h: Hypothesis) -> None:
-        """Fit with every cause taken out, and with resonances of the stack's own in its place.
+        """Fit with every cause taken out, and with resonances of the stack in its place.
 
         Several modes that leave structure are challenged by a single one.
         """

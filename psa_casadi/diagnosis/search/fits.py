@@ -144,14 +144,14 @@ def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
 
 
-#: Evaluations of quick fits beside other causes, of sets from default values, and of one effect
-#: that goes on; of these the best so many of one effect, and of any; there the gain begins at so
-#: many ordinary sizes.
+#: Evaluations of quick fits with other causes present, of sets from default values, and of one
+#: effect whose fit continues; number of the best fits that continue, of one effect and of any;
+#: start of the gain there, in ordinary sizes.
 _BESIDE, _SET_AFRESH, _AFRESH = 12, 17, 45
 _CONTINUED, _CONTINUED_ANY, _ORDINARY = 2, 4, 2.5
-#: Shares of their gains with which the causes begin that are left without another.
+#: Shares of their gains with which the causes start that are left without another.
 _SHARES = (1.0, 0.3, 0.0)
-#: Shares of its gain with which a cause near the end of its range begins again.
+#: Shares of its gain with which a cause near the end of its range restarts.
 _AGAIN = (0.5, 2.0)
 #: Tolerance of stepper and fit, and evaluations, to the end.
 _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
@@ -213,7 +213,7 @@ def fit_from_default(
 
     A base fit without the effect has bent its loop and its lags to imitate it, and may hold the
     search there. Where the gain acts by thresholds or lags, it starts at their steps as well.
-    What is found is of use below the cost of the first fit, and below the `goal`.
+    The result is of use below the cost of the first fit, and below the `goal`.
     """
     effect = first.causes[-1]
     fits = _from_ordinary(before.fit, before.experiments, effect, first.fit.model.values)
@@ -246,7 +246,7 @@ def in_place(
 ) -> Hypothesis | None:
     """Fit an effect with the causes of `less`, where the `whole` has another one.
 
-    The effect begins with its values in its `alone` fit, the rest with those that were `reached`;
+    The effect starts from its values in the fit `alone`, the rest from those in the fit `reached`;
     what `reached` does not have stays as in `less`.
     """
     values = alone.model.values
@@ -266,7 +266,7 @@ def like(
 ) -> Hypothesis | None:
     """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
 
-    `less` is the hypothesis without the cause; its base is bent to imitate it. The effect begins
+    `less` is the hypothesis without the cause; its base is bent to imitate it. The effect starts
     with the gain that copies best.
     """
     effect, direction = copy.direction.effect, copy.direction
@@ -369,7 +369,7 @@ def to_end(of: Hypothesis, goal: float = np.inf) -> Hypothesis:
 def refit_at_bound(of: Hypothesis) -> Hypothesis | None:
     """Fit once more where a cause has come near the end of its range: another minimum may hold it.
 
-    That cause begins with its declared values, at half and at twice its gain; what is found is of
+    That cause restarts from its declared values, at half and at twice its gain; the result is of
     use below the cost of the fit. None where no cause is near an end.
     """
     values = of.fit.model.values
@@ -424,7 +424,7 @@ _Base = tuple[dict[str, float], tuple[dict[str, float], ...]]
 
 
 def _ordinary_base(before: Fit, experiments: Sequence[Experiment], *, soon: bool = False) -> _Base:
-    """Return an ordinary stack at rest; any other model goes on from its own values and states.
+    """Return an ordinary stack at rest; any other model goes on from its values and states.
 
     The states of a loop that is bent would bend the ordinary one.
     """
@@ -437,7 +437,7 @@ def _ordinary_base(before: Fit, experiments: Sequence[Experiment], *, soon: bool
 def _best_continued(
     fits: Sequence[Fit], experiments: Sequence[Experiment], count: int, goal: float = np.inf
 ) -> Fit | None:
-    """Go on with the best so many fits, unless they stay above the goal; return the best then."""
+    """Continue the `count` best fits, unless they stay above the goal; return the best then."""
 
     def further(quick: Fit) -> Fit:
         try:
@@ -451,7 +451,7 @@ def _best_continued(
 
 
 def _typical(before: Fit, effect: Component) -> float:
-    """Return an ordinary size of an effect's gain beside a fit."""
+    """Return an ordinary size of an effect's gain in the model of a fit."""
     gain = _parameter(effect, effect.gain)
     return gain.typical(before.model.with_effect(effect, {gain.name: 0.0}).values)
 

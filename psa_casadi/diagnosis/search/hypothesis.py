@@ -54,8 +54,8 @@ class Hypothesis:
     `causes` are in the order of the search; `predictions` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
     held-out, in fitted and in all samples, over the records' shares of the noise, in its unit;
-    `colours` are those that every channel's residual has by itself; `final` says that the fit went
-    on to its end.
+    `colours` are those that every channel's residual has by itself; `final`: the fit went on to
+    its end.
     """
 
     causes: tuple[Component, ...]
@@ -75,7 +75,7 @@ class Hypothesis:
 
     @property
     def colour(self) -> Colour:
-        """The colour of its own residual, in every channel's fitted samples."""
+        """The colour of its residual, in every channel's fitted samples."""
         first, *others = (item.colour for item in self.colours)
         return replace(first, further=tuple(others))
 
@@ -105,7 +105,7 @@ class Hypothesis:
         return frozenset(c.name for c in self.causes)
 
     def names_upto(self, count: int) -> frozenset[str]:
-        """Names of the first so many causes."""
+        """Names of the first `count` causes."""
         return frozenset(c.name for c in self.causes[:count])
 
     def removes(self, before: "Hypothesis") -> float:
@@ -253,7 +253,7 @@ def scale_of(base: Hypothesis, colour: Colour, limits: Thresholds) -> Scale:
     return Scale(base, colour, limits, held, any(e.held_out_whole for e in experiments))
 
 
-#: So many starts each effect gets.
+#: Largest number of starts of each effect.
 _STARTS = 2
 
 
@@ -324,7 +324,7 @@ class View:
     def shows(self) -> bool:
         """Whether a direction is above the threshold and promises more than the detection limit.
 
-        With a cause the test must alarm too: what it leaves of its own form shows in directions.
+        With a cause the test must alarm too: the error of the cause's form shows in directions.
         """
         fit, asked = self.of.fit, self.test.alarm or not self.of.causes
         significant = self.decrease >= self.screening.threshold

@@ -30,7 +30,7 @@ _ENOUGH, _EVALUATIONS = 20_000, 20
 #: To what share of the rms each mode must bring the residual. The seven largest of a mirror's axis
 #: do, the next one does not; noise has no mode that does.
 _LOWERED = 0.95
-#: So many fits of one mode in the place of several go to their end.
+#: Number of fits of one mode in the place of several that go to their end.
 _ALONE = 3
 _RTOL = 1e-4
 
@@ -107,7 +107,7 @@ def _even(time: FloatArray) -> bool:
 
 
 def _moving(e: Experiment, most: int) -> slice:
-    """Return so many samples at most, from where the voltage starts to move."""
+    """Return `most` samples at most, from where the voltage starts to move."""
     v = e.record.voltage[: e.stop]
     moves = np.flatnonzero(v != v[0])
     begin = max(0, int(moves[0]) - 1) if moves.size else 0
@@ -131,7 +131,7 @@ def _at_rest(model: Model, record: Record, count: int) -> FloatArray:
     return result / stiffness_scale(model.values)
 
 
-#: So many rivals of a cause are fitted, and so many copies.
+#: Largest number of rivals of a cause that are fitted, and of copies.
 _MOST = 3
 
 
@@ -217,9 +217,9 @@ def _effect(starts: Sequence[Score]) -> Component:
     return starts[0].direction.effect
 
 
-#: So many sets are fitted.
+#: Largest number of sets that are fitted.
 _SETS = 4
-#: ... of which so many are pairs with the best cause alone.
+#: ... and of those among them that are pairs with the best cause alone.
 _PAIRS = 2
 
 

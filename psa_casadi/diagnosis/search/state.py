@@ -25,12 +25,12 @@ from psa_casadi.identification.refitting import relevelled
 from psa_casadi.notes import Note
 from psa_casadi.simulation.side_by_side import side_by_side
 
-#: Neighbours are nearly as likely as the best one if their evidence is this share of its, or within
-#: so many nats of it.
+#: Share of the best one's evidence from which neighbours are nearly as likely, and distance from it
+#: [nats] within which they are so too.
 SHARE, NEAR = 0.8, 30.0
-#: So many fits of neighbours go to their end.
+#: Number of fits of neighbours that go to their end.
 FINALISTS = 3
-#: Fits of one set whose evidence differs by so many nats at most are the same minimum.
+#: Largest difference of evidence [nats] at which fits of one set are the same minimum.
 _SAME = 1.0
 #: Effects far behind in the screening are fitted from default values where less than this share of
 #: the excess power is explained.

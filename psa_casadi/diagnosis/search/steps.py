@@ -44,10 +44,10 @@ class Step:
     `fitted` are the hypotheses with one more effect; `alone` is ln B of every effect over this
     hypothesis, of all samples that choose (`Scale.gain`), `evidence` that over all other causes
     where there are later ones, and of effects that bend the same curve the best one's;
-    `probability` that of being the cause, given that one effect of the table is. `chosen` is the
-    hypothesis with the next cause, None of the last step; `without` the one with all causes but
+    `probability` that of being the cause, on condition that one effect of the table is. `chosen` is
+    the hypothesis with the next cause, None of the last step; `without` the one with all causes but
     this, `view_without` what that one leaves, and `instead` the hypotheses with other effects in
-    this cause's place. `remarks` of the last step say what the search has left.
+    this cause's place. `remarks` of the last step state what the search has left.
     """
 
     view: View
@@ -104,7 +104,7 @@ def unsearched(base: Fit, task: Task) -> list[Step]:
 
 
 def _way(known: SearchState, count: int) -> Hypothesis:
-    """Return the hypothesis with the first so many of the best one's causes."""
+    """Return the hypothesis with the first `count` of the best one's causes."""
     best = known.answer
     fitted = known.hypotheses.get(best.names_upto(count))
     if fitted is not None:
@@ -203,9 +203,9 @@ def contenders(step: Step, limits: Thresholds, names: Sequence[str] = ()) -> tup
 def one_of_each(
     result: Sequence[Contender], experiments: Sequence[Experiment]
 ) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
-    """Return contenders of which a voltage may tell one from another, and what none will tell.
+    """Return the contenders that a voltage may separate, and notes on those that none separates.
 
-    Of effects that bend the same curve the best fit stands for all.
+    Of effects that bend the same curve the best fit represents all.
     """
     best = sorted(result, key=lambda c: c.fit.cost)
     effects = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
@@ -234,7 +234,7 @@ def fit_contenders(
 
 
 def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
-    """Fit each effect of a task beside the base, without a verdict.
+    """Fit each effect of a task with the base, without a verdict.
 
     Raises InputError where an effect cannot be fitted.
     """

@@ -150,7 +150,7 @@ def _units(table: Iterable[Variable]) -> list[tuple[str, dict[str, str] | None, 
             units |= {variable.display_unit} if variable.display_unit else set()
 
     def display(name: str, unit: Unit) -> Attributes:
-        other = parse_unit(name)  # value shown = factor * value + offset
+        other = parse_unit(name)  # displayed value = factor * value + offset
         offset = number((unit.offset - other.offset) / other.factor)
         factor = number(float(unit.ratio / other.ratio))
         moved = unit.offset != other.offset

@@ -77,7 +77,7 @@ class Played:
     ) -> list[FloatArray]:  # fmt: skip
         """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
 
-        A step of co-simulation is divided into so many `parts`. Raises SimulationError with the
+        Each step of co-simulation is divided into `parts`. Raises SimulationError with the
         FMU's message.
         """
         return RUNS.of([self._of(values, u, t, hold, parts) for values, u in wanted])

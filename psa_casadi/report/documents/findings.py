@@ -49,8 +49,8 @@ def read_findings(
     A result, of a stack or of any other model, is what `identify`, `diagnose` and
     `load_diagnosis` return; it has the name of its first record. A path is a DIAGNOSIS.json, what
     `psa identify --json` wrote, a MODEL.json, or a device's folder of `psa batch`. A model of the
-    same records as a diagnosis or identification is part of it. `traces` says whether models play
-    the records that their files carry. `effects` are a user's.
+    same records as a diagnosis or identification is part of it. With `traces`, models simulate the
+    records that their files carry. `effects` are a user's.
 
     Raises:
         InputError: what cannot be read, all of it.

@@ -53,7 +53,7 @@ _NO_BOUND = 1e300
 class LiveRecord:
     """An output of a record that a model runs on, with the model's curve, as fitted, as its last.
 
-    `inputs` are arrays (n,) in SI units by name, between samples as `hold` says; a loop is drawn
+    `inputs` are arrays (n,) in SI units by name, between samples by `hold`; a loop is drawn
     over the one `along`. `deviation` holds the start of states off where a stack's voltage puts
     them, any other model starts at the states `start` (nx,). A sensor with an `offset` has it
     estimated again. `floor` is the noise that errors are judged by, `correction` what an unnamed
@@ -285,8 +285,8 @@ def singles(values: npt.ArrayLike) -> str:
 def live_data(model: Model, module: bytes) -> dict[str, Any]:
     """Return a model for `psaLive.load`, all values in SI units.
 
-    Each parameter has `unit`, in which a page shows it, with `factor` and `shift`: shown = factor *
-    value + shift; and the ends of its slider.
+    Each parameter has `unit`, in which a page shows it, with `factor` and `shift`: displayed =
+    factor * value + shift; and the ends of its slider.
     """
     try:
         file = dumps(model)

@@ -258,7 +258,7 @@ def blindest(d: StackDiagnosis) -> tuple[BlindSpot, ...]:
 
 
 def blind_table(d: StackDiagnosis) -> Table:
-    """Return the effects of practical size that the records could not have shown."""
+    """Return the effects of practical size that the records could not have revealed."""
     rows = []
     for b in blindest(d):
         # a screening without any direction for the effect reports the largest number there is

@@ -67,7 +67,7 @@ def sensitive(text: str) -> str:
 
 
 def of_linear_part(reach: BoolArray, needed: Sequence[int], linear: Sequence[int]) -> str:
-    """Return what the linear part does to columns x, and its matrices' own derivatives, as C.
+    """Return what the linear part does to columns x, and its matrices' derivatives, as C.
 
     Rows are those of the whole step and then those `needed` inside it; `reach` marks the entries
     of a row that are not zero, `linear` which state each is of.

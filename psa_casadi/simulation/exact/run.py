@@ -1,7 +1,7 @@
 """Runs of a model by exact steps of its linear part: for fits and simulations of sampled records.
 
 Works where the model splits (`split_of`) and the record has few different time steps. The C code is
-`fmu_src/exact.c`; its sensitivities are the derivatives of its own discrete equations.
+`fmu_src/exact.c`; its sensitivities are the derivatives of its discrete equations.
 """
 
 import ctypes
@@ -70,7 +70,7 @@ class ExactSteps:
     """What a run returns: outputs `requested` (n, m), their derivatives `sensitivity` (n, m, k).
 
     `x` (n, nx) and `y` (n, ny) are all states and outputs, without rows if the run is not for
-    `everything`. `forced` steps missed the tolerance at the finest length.
+    `everything`. `forced` counts the steps that exceed the tolerance at the finest length.
     """
 
     requested: FloatArray

@@ -6,7 +6,7 @@ A stack is a cascade. Most of it is linear with constant coefficients,
 
 with M, B and c functions of the parameters and a *port* n_i for each row that is not linear: all of
 that row that the linear part leaves. States of hysteresis change along the path of another state
-(the *driver*), whatever its course in time: they rest where it rests. Both are found here from the
+(the *driver*), whatever its course in time: they rest where it rests. Both follow here from the
 equations alone, by their sparsity and by what the derivatives depend on. Ports and groups of states
 along one driver are evaluated in the order in which they feed each other; a port that feeds back to
 what it depends on (a load's stiffness) is solved for.

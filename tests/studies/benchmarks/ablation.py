@@ -16,9 +16,9 @@ from tests.studies.plants.table import FOREIGN, KNOWN
 FIRST, SEVERAL = 770901, 205511
 #: Seeds for each effect of the study that these are a part of.
 _SEEDS, _QUICK_SEEDS = 5, 1
-#: So many cases show what a constant does, where that is to be quick.
+#: Number of cases that show what a constant does, where that is to be quick.
 _FASTEST = 15
-#: Of a study with one seed for each effect every so manyth case of a kind is repeated.
+#: Step between the cases of a kind that are repeated, of a study with one seed for each effect.
 _EVERY = {"known": 2, "weak": 4, "clean": 2, "ringing": 1, "foreign": 2, "left out": 3, "two": 1}
 #: Diagnoses cases by a method.
 Diagnosed = Callable[[Sequence[Case], Method], Sequence[CaseResult]]

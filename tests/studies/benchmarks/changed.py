@@ -35,8 +35,8 @@ from tests.studies.plants.table import FOREIGN, HIDDEN_EFFECTS, KNOWN, called
 #: The first of the seeds of `stability`, which no other benchmark uses; the change of the data over
 #: the rms of their noise; that of the measured records [m].
 FIRST, CHANGE, _MEASURED_NOISE = 480201, 0.01, 67e-9
-#: Cases of the study and draws of each; draws of records of the exam, of which a quick run takes
-#: one of so many, and of measured rows.
+#: Cases of the study and draws of each; draws of records of the exam, step between those that a
+#: quick run takes, and draws of measured rows.
 CASES, DRAWS, EXAM_DRAWS, QUICK_EXAM, MEASURED_DRAWS = 40, 20, 3, 12, 9
 _KINDS = ("known", "weak", "clean", "foreign", "left out", "two", "poor", "design", "ringing")
 #: Measured records.
@@ -118,7 +118,7 @@ SIZE = 3.0
 _LEAD = 400
 
 
-#: Every so many cases the figures with a reference were tuned on; the others are reported.
+#: Step between the cases that the figures with a reference were tuned on; others are reported.
 TUNED = 3
 #: Fewer samples are no reference.
 _FEWEST = 400
@@ -265,7 +265,7 @@ def summary(cases: Sequence[Added]) -> TitledTable:
         return {"figure": figure, "asked": target, **shares}
 
     def wrong(f: Added, way: int) -> set[str]:
-        """Return the wrong names; without a reference the record's own causes are right too."""
+        """Return the wrong names; without a reference the record's causes are right too."""
         return {*f.answers[way].named} - {called(f.effect), *(() if way else f.before)}
 
     def single_wrong(f: Added, way: int) -> bool:
@@ -293,8 +293,9 @@ def summary(cases: Sequence[Added]) -> TitledTable:
 
 #: The seed of `excerpts`, which no other benchmark uses; pieces; their samples.
 SEED, PIECES, QUICK_PIECES, LENGTHS = 740501, 200, 6, (300, 2500)
-#: Scales of the displacement, units mistaken by a power of ten among them; every so many samples
-#: are kept of long pieces; share of pieces whose displacement or voltage is turned round.
+#: Scales of the displacement, units mistaken by a power of ten among them; steps between samples
+#: that are kept of long pieces, and how long these are; share of pieces whose displacement or
+#: voltage is turned round.
 _SCALES, _KEPT, _LONG, _TURNED = (1.0, 1.0, 1.0, 10.0, 1e3, 1e-3), (1, 1, 2, 5), 1500, 0.15
 
 
@@ -310,7 +311,7 @@ def excerpts(progress: Progress, quick: bool) -> Outcome:
 
 
 def pieces(records: Sequence[psa.Record], count: int) -> list[psa.Record]:
-    """Return so many pieces of records, in turn, each named after its changes."""
+    """Return `count` pieces of records, in turn, each named after its changes."""
     rng, result = np.random.default_rng(SEED), []
     for k in range(count):
         whole = records[k % len(records)]

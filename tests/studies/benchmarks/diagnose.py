@@ -153,8 +153,8 @@ class Covered(NamedTuple):
     """Reductions of the error [%] over further records, and the intervals that should hold them.
 
     `blocks` is the interval from the blocks of the diagnosed record, for the reduction over all
-    further records; `experiments` are those from so many further records, `others` the reductions
-    over the rest of them.
+    further records; `experiments` are those from groups of `HELD_OUT` further records, `others` the
+    reductions over the rest of them.
     """
 
     effect: str

@@ -161,7 +161,7 @@ def fine_curve(displacement: FloatArray, low: float, high: float, knots: int) ->
 
 
 def _lagging(v: FloatArray, time: float) -> FloatArray:
-    """Return a voltage behind a first-order lag of so many samples, settled at its start."""
+    """Return a voltage behind a first-order lag of `time` samples, settled at its start."""
     a = float(np.exp(-1.0 / time))
     lag, _ = lfilter([1.0 - a], [1.0, -a], v, zi=[a * v[0]])
     values: FloatArray = lag
@@ -172,8 +172,8 @@ def _lagging(v: FloatArray, time: float) -> FloatArray:
 #: slower and less damped ones imitate loops at the frequency of the voltage.
 _FREQUENCIES, _DAMPINGS = np.linspace(0.02, 0.495, 96), (0.005, 0.02, 0.08)
 _SLOWEST, _FASTEST, _LEAST, _MOST = 0.02, 0.4999, 4e-3, 0.7
-#: A line is so many times larger than the median of so many neighbours in the spectrum; of noise
-#: alone the largest of 10,000 is 3.6 times as large.
+#: Smallest ratio of a line to the median of its neighbours in the spectrum, and number of these; of
+#: noise alone the largest of 10,000 is 3.6 times as large.
 _STANDS_OUT, _NEIGHBOURS = 5.0, 101
 #: Relative size of a ridge that only keeps the projections regular; steps of a refinement.
 _REGULAR, _STEPS = 1e-9, 60

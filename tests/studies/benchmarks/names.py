@@ -21,7 +21,7 @@ from tests.studies.second_exam import cases as second
 
 #: Classes of stated probability: above the one, up to the next. No probability exceeds 99 %.
 BINS = (0.0, 0.5, 0.8, 0.9, 0.98, 1.0)
-#: A quick run takes so many records, evenly from all.
+#: Number of records that a quick run takes, evenly from all.
 QUICK = 12
 GROUPS = {
     "one": "one cause", "two": "two causes", "three": "three causes", "foreign": "foreign cause",

@@ -19,7 +19,7 @@ from tests.any_model import hard_plants as hard
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
 
 Table = hard.Table
-#: Every so many samples of EMPS are taken (1 kHz, whose force is held).
+#: Step between the samples of EMPS that are taken (1 kHz, whose force is held).
 _EVERY = 10
 
 

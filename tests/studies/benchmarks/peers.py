@@ -188,7 +188,7 @@ WANTED, TOLERANCES = 1e-5, tuple(10.0 ** (-k / 2) for k in range(6, 21))
 OURS = "psa.simulate_many"
 #: Parameters that differ between the sets, each by 10 %.
 _DRAWN = ("k_L", "A", "beta", "gamma", "tau", "R_s", "k_B", "m_B")
-#: What peers run of the work: so many samples; the error is that of so many sets.
+#: What peers run of the work: number of samples, and number of sets whose error counts.
 _PART, _JUDGED = 500, 3
 _TRUTH, _CHECK = 1e-11, 1e-10
 _REPEATS, _SLOW = 3, 2.0

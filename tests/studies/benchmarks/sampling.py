@@ -54,7 +54,7 @@ def _size(draws: FloatArray, method: str) -> float:
 
 
 def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
-    """Return both ways on one record for so many draws of PyMC, and whether they agree."""
+    """Return both ways on one record for `size` draws of PyMC, and whether they agree."""
     if find_spec("pymc") is None:
         missing = "PyMC is not installed: `pip install --group sampling`."
         return Outcome((TitledTable("Beside PyMC", (), missing),))

@@ -16,7 +16,7 @@ set, `modal_series` of any order also where `structural_mode` is.
 A set may hold families too, "place kind" as in "plant relaxation": what `score` counts besides
 marks. A family is right if it is in a set, or that of a name in it, or if the name is right.
 
-Where a wrong name has 90 % or more and nothing is right, the mark says so; of a clean record also
+Where a wrong name has 90 % or more and nothing is right, the mark states so; of a clean record also
 where it comes with a right one.
 """
 

@@ -1,6 +1,6 @@
 """All records of the exam, as a table.
 
-A record is its name and what it says to hide, its stack, its test, the hidden causes with their
+A record is its name and what it hides, its stack, its test, the hidden causes with their
 values, and the names that are right for each of them. Stack: hysteresis, stroke, and what is not
 usual. Test: voltage, frequency, rate, samples, lowest and highest voltage, noise, and what is not
 usual. Names: `c` clean stacks of six kinds of hysteresis, `k` what the package lists, in other

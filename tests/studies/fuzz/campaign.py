@@ -54,7 +54,7 @@ class Target:
     `make` returns an input drawn from a generator. `attack` does something with it in an empty
     folder and yields what must not be; an error of the package is a refusal of the input,
     which is right, any other is a failure. `share` is the part of a room's time that it gets,
-    `limit_s` how long one input may take, `memory` what a process may take beside what it has
+    `limit_s` how long one input may take, `memory` what a process may take besides what it has
     [bytes]. `prepare` is called before the first process is forked, which has what it loads.
     """
 
@@ -136,7 +136,7 @@ def run(
 ) -> Tally:
     """Attack the targets and return what was counted.
 
-    With so many inputs of each target from `first` on, or for seconds for all of them; `keep` is
+    With `inputs` of each target from `first` on, or for `seconds` for all of them; `keep` is
     the folder for failing inputs. Ctrl-C ends it early, with what was counted until then.
     """
     until, tally, running = time.monotonic() + seconds, Tally(seed), list[_Worker]()

@@ -56,7 +56,7 @@ def _damage(data: bytearray, rng: Random) -> None:
 
 
 def _change_number(data: bytearray, rng: Random) -> None:
-    """Put a number of 1 to 8 bytes where one may stand; or change the one that stands there."""
+    """Put a number of 1 to 8 bytes where one may be; or change the one that is there."""
     size = rng.choice((1, 2, 4, 4, 8))
     place = rng.randrange(len(data) - size + 1)
     place -= place % size if rng.random() < 0.8 else 0
@@ -116,7 +116,7 @@ def damaged_words(text: str, rng: Random, words: Sequence[str]) -> str:
     return text
 
 
-#: Text that stands for a value which JSON cannot spell, put in after the tree is written.
+#: Text in the place of a value which JSON cannot spell, put in after the tree is written.
 _RAW = ("NaN", "Infinity", "-Infinity", "1e400", "-1e400", "9" * 5000, "1" * 310, "[" * 3000,
         '{"a":' * 2000, '"\\ud800"', "'x'", "0x1", "1.", "tru", '{"a": 1, "a": 2}')  # fmt: skip
 _VALUES: tuple[Any, ...] = (

@@ -146,7 +146,7 @@ def _record_file(suffix: str, rng: Random) -> bytes:
             for part, content in parts.items():
                 archive.writestr(zipfile.ZipInfo(part), content)
         return stream.getvalue()
-    if suffix == ".parquet" and kind < 0.7:  # what describes the columns, with its own length
+    if suffix == ".parquet" and kind < 0.7:  # what describes the columns, with its length
         start = len(data) - 8 - struct.unpack_from("<I", data, len(data) - 8)[0]
         footer = damaged_bytes(data[start:-8], rng)
         return data[:start] + footer + struct.pack("<I", len(footer)) + b"PAR1"

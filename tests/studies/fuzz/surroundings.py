@@ -44,7 +44,7 @@ class Odd:
 
     Without `words` the command must work. The command runs as a user who may not do everything.
     `place` is made in the command's folder, `variable` names it, and `output` is written there;
-    `first` is called with the folder in the process before the command begins; `streams` are
+    `first` is called with the folder in the process before the command starts; `streams` are
     standard input, output and error by the files that take their place.
     """
 

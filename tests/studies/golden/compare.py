@@ -16,7 +16,7 @@ _ROUNDING = {
     "numbers": (1e-5, 0.0), "parameters": (5e-3, 0.0), "errors": (0.05, 1e-8),
 }  # fmt: skip
 PROBABILITY = 0.02
-#: A change of processor time by this factor, of a case of more than a second, is shown.
+#: A change of processor time by this factor, of a case of more than a second, is reported.
 SLOWER = 1.25
 _SURE = re.compile(r" (\d\.\d+)")
 

@@ -8,7 +8,7 @@ Equations (u voltage on the stack, v command, piecewise linear between samples):
     mechanics   five poles and a zero from force to displacement, paper eq. (10), (13)
 
 The drive is exact on every sub-interval (one exponential). The hysteresis takes fourth-order
-Runge-Kutta steps along the path of u, which is cut at every reversal of u (found in closed form).
+Runge-Kutta steps along the path of u, which is cut at every reversal of u (in closed form).
 The mechanics is a sum of partial fractions, one first-order recursion for each pole, exact for a
 force that is linear on each sub-interval. The elastic part k_L u goes from v to the displacement
 through six poles, exact without any sub-division.
@@ -78,7 +78,7 @@ class Run:
 def simulate_base(
     stack: Stack, times: FloatArray, command: FloatArray, sub_intervals: int = SUB_INTERVALS
 ) -> Run:
-    """Simulate the paper's model for a voltage given at uniform times, (N,) [s], (N,) [V]."""
+    """Simulate the paper's model for a voltage at uniform times, (N,) [s], (N,) [V]."""
     fine_time, fine_command = refine(times, command, sub_intervals)
     return _driven(stack, times, command, fine_time, fine_command, sub_intervals)
 

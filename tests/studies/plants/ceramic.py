@@ -80,7 +80,7 @@ def slow_creep(run: Run, p: Parameters, gain: float) -> FloatArray:
         x_creep(t) = g sum_j Dx(t_j) lg(1 + (t - t_j)/t_0)
 
     Dx(t_j): increments of the base displacement; g: creep for each decade of time; t_0:
-    where creep begins. Source: H. Jung and D.-G. Gweon, "Creep characteristics of
+    time at which creep starts. Source: H. Jung and D.-G. Gweon, "Creep characteristics of
     piezoelectric actuators", Rev. Sci. Instrum. 71 (2000) 1896 (logarithmic law);
     superposition over the voltage history after L. Boltzmann. Not the project's form: a sum
     of relaxations is a set of exponentials with a last time constant, after which it stops;
@@ -137,7 +137,7 @@ def _plays(
 
 
 def _growing_plays(d: Draw) -> dict[str, float]:
-    """Rate q [V/s] where growth begins, share W of the force that plays, and the plays."""
+    """Rate q [V/s] where growth starts, share W of the force that plays, and the plays."""
     span = d.run.stack.u_rated
     return _plays(
         d, _GROWING, 0.25, lambda: {"q": d.uniform(0.3, 1.5) * span, "share": d.uniform(0.25, 0.45)}
@@ -211,7 +211,7 @@ def asymmetric_memory(run: Run, p: Parameters, gain: float) -> FloatArray:
     p_j: play operators of the voltage u with thresholds over 4 to 18 % of the span
     (hysteresis_memory.py). Rising and falling branches differ more the higher the voltage,
     so that no symmetric memory forms the loop. Not the project's form: hard operators, and
-    every one of them has an envelope of its own. Source: M. Al Janaideh, S. Rakheja, C.-Y.
+    every one of them has a separate envelope. Source: M. Al Janaideh, S. Rakheja, C.-Y.
     Su, "An analytical generalized Prandtl-Ishlinskii model inversion for hysteresis
     compensation in micropositioning control", IEEE/ASME Trans. Mechatronics 16 (2011) 734:
     envelope functions of the play; here 1 + b u.
@@ -226,7 +226,7 @@ def asymmetric_memory(run: Run, p: Parameters, gain: float) -> FloatArray:
 
 @hidden("g", "1", (0.01, 0.8), drawn=lambda d: {"branch": d.sign()})
 def rate_independent_asymmetry(run: Run, p: Parameters, gain: float) -> FloatArray:
-    """Ascending and descending branches that curve differently, at every rate alike.
+    """Ascending and descending branches that curve differently, equally at every rate.
 
         df_H = A du - r^n (beta sgn(f_H) |du| + gamma du + g beta |du|) + delta u sgn(u') dt
 
@@ -339,7 +339,7 @@ def ageing(run: Run, p: Parameters, gain: float) -> FloatArray:
 
         x -> x (1 - g lg(1 + N/N_0)),   N = integral |du|/(2 u_r)
 
-    N: cycles at rated voltage u_r that the travel is worth; g: loss for each decade.
+    N: cycles at rated voltage u_r that equal the travel; g: loss for each decade.
     Source: D. A. Hall and M. M. Ben-Omran, "Ageing of high field dielectric properties in
     BaTiO3-based piezoceramics", J. Phys.: Condens. Matter 10 (1998) 9129 (logarithmic law,
     there in time). Not the project's form: the clock is the travel of the voltage.

@@ -54,7 +54,7 @@ class HiddenEffect:
     name: as in the project's table of effects, or a name that the table lacks (foreign). gain,
     unit: what scales it. plausible: smallest and largest gain that a real set-up could have. adds:
     (run, secondary parameters, gain) -> displacement with the effect minus without it at the
-    samples, (N,) [m]; not asked at gain 0, where it is zero. drawn: its secondary parameters.
+    samples, (N,) [m]; not called at gain 0, where it is zero. drawn: its secondary parameters.
     linear: it is proportional to the gain. room: (times, secondary parameters) -> temperature at
     the samples, (N,) [degC], where the effect needs a thermometer in the record. refit: the base
     swallows it far beyond its linearisation (a lag: R_s C_p and tau take it over), so its visible

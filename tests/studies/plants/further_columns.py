@@ -1,7 +1,7 @@
-"""Records with a column beside the displacement: monitor, charge, second sensor, load cell.
+"""Records with a column besides the displacement: monitor, charge, second sensor, load cell.
 
-The stack is the one of `make.py` with one hidden effect; every further column has a scale, a zero
-and white noise of its own. `amplifier` and `capacitance` are hidden here alone, as only such
+The stack is the one of `make.py` with one hidden effect; every further column has a separate scale,
+zero and white noise. `amplifier` and `capacitance` are hidden here alone, as only such
 columns show them.
 """
 
@@ -28,7 +28,7 @@ from tests.studies.plants.sensor import bend as bent
 from tests.studies.plants.stack import FloatArray, draw_stack
 from tests.studies.plants.table import HIDDEN_EFFECTS
 
-#: Noise of the displacement over its range, and of a further column over its own.
+#: Noise of the displacement over its range, and of a further column over that column's.
 NOISE, FURTHER_NOISE = 1e-3, 2e-3
 #: How sharply a curve bends over.
 SHARPNESS = 1.9

@@ -40,9 +40,9 @@ Visible = float | tuple[float, float]
 class Hidden:
     """One effect in a record.
 
-    gain, parameters: the effect's own, SI. visible: rms of what the base cannot absorb over the
+    gain, parameters: those of the effect, SI. visible: rms of what the base cannot absorb over the
     noise's. gain_limited: the gain wanted was beyond the plausible range and was clipped (for
-    an effect with `refit`: the ratio wanted was missed by more than a quarter). added:
+    an effect with `refit`: the ratio is off the wanted one by more than a quarter). added:
     what the effect adds to the displacement, (N,) [m].
     """
 
@@ -163,7 +163,7 @@ def added_by(run: Run, effects: Sequence[Effect]) -> FloatArray:
 
     A sum of what each adds to the base alone is no device where they are large: a lag or a delay
     that a base model takes over nearly as a whole may add forty times the noise, and two of them,
-    summed, let a step begin the other way. Those of one place act in the order given. Between
+    summed, let a step begin the other way. Those of one place act in their order. Between
     the samples an effect of stack or sensor is a cubic spline.
     """
     total = np.zeros_like(run.times)
@@ -222,7 +222,7 @@ def refitted_ratio(run: Run, contribution: FloatArray, sigma: float) -> float:
     """As `visible_ratio`, with the base fitted again instead of linearised: what a lag leaves once
     R_s C_p, tau and the dampings have taken over what they can. A few seconds; coarse grid.
 
-    The dampings' own lags, c_P/k_P and c_B/k_B, may be far below the sampling interval, where no
+    The dampings' lags, c_P/k_P and c_B/k_B, may be far below the sampling interval, where no
     slope leads out: a second fit frees them from half of it.
     """
     start = simulate_base(run.stack, run.times, run.command, COARSE_SUB_INTERVALS).displacement

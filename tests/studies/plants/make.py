@@ -29,7 +29,7 @@ THERMOMETER = ",temperature [degC]"
 class Truth:
     """What is behind a record.
 
-    effect: the hidden effect or None. gain and parameters: the effect's own, SI. stack: the base.
+    effect: the hidden effect or None. gain, parameters: those of the effect, SI. stack: the base.
     sigma, quantum: rms of the noise and count of the sensor [m]. visible: rms of what the base
     cannot absorb over sigma. gain_limited: the gain wanted was beyond the effect's plausible range
     and was clipped. times, voltage, displacement, base_displacement: (N,) clean [s, V, m], the last

@@ -28,7 +28,7 @@ def structural_mode(run: Run, p: Parameters, gain: float) -> FloatArray:
 
     by modal superposition: one complex pole p = -zeta w + i w_d on the fine grid, x_mode =
     g w^2/w_d Im z, z' = p z + x_f. Source: modal superposition, e.g. D. J. Ewins, "Modal
-    Testing". Not the project's form: a convolution beside the stack driven by the force
+    Testing". Not the project's form: a convolution parallel to the stack driven by the force
     before the lag, not two more states driven by the displacement.
 
     g is the mode's static share of the displacement.
@@ -168,7 +168,7 @@ def guide_stiffness(run: Run, p: Parameters, gain: float) -> FloatArray:
         x + g (w_s tanh((x - x_c)/w_s) - w_s tanh((0 - x_c)/w_s)) = x_free
 
     Bilinear with a rounded corner: stiffness 1 + g within w_s of the centre x_c, 1 outside,
-    alike on both sides, so not a contact. w_s is a small part of the range, too narrow for
+    equal on both sides, so not a contact. w_s is a small part of the range, too narrow for
     a low polynomial. Solved statically by bisection. Source: guides that are stiff before
     they slide, and buckled flexures, e.g. S. Henein, "Conception des guidages flexibles",
     ch. 4.
@@ -231,7 +231,7 @@ def cross_axis(run: Run, p: Parameters, gain: float) -> FloatArray:
         x_cross = g (w - a (w - play(w, r))),   w: random-phase signal within a band, rms 1
 
     w has 12 random frequencies between f_1 and f_2 (0.4 to 4 Hz in a record of some
-    seconds), unrelated to the voltage of this axis; the neighbour's own hysteresis is a
+    seconds), unrelated to the voltage of this axis; the neighbour's hysteresis is a
     play operator. Source: crosstalk of parallel-kinematic stages, e.g. Y. K. Yong, S. O. R.
     Moheimani, B. J. Kenton and K. K. Leang, Rev. Sci. Instrum. 83 (2012) 121101.
     """
@@ -244,7 +244,7 @@ def cross_axis(run: Run, p: Parameters, gain: float) -> FloatArray:
 
 
 def two_masses(run: Run, load: FloatArray | None = None) -> FloatArray:
-    """A stack of two masses with action and reaction, beside the paper's one-way cascade.
+    """A stack of two masses with action and reaction, unlike the paper's one-way cascade.
 
         M z'' + C z' + K z = (f_out, f_load),   z = (y, x)
         M = diag(m_P, m_B),  C = [[c_P + c_B, -c_B], [-c_B, c_B]],  K likewise of k_P, k_B

@@ -78,7 +78,7 @@ def _grating(d: Draw) -> dict[str, float]:
 
 
 def angle_error(angle: FloatArray, parameters: Parameters) -> FloatArray:
-    """Error of the angle that the two signals tell [rad]."""
+    """Error of the angle that the two signals yield [rad]."""
     first = np.cos(angle + parameters["c"]) + parameters["p"]
     second = (1.0 + parameters["k"]) * np.sin(angle) + parameters["q"]
     result = np.arctan2(second, first) - angle
@@ -271,7 +271,7 @@ def source_power(run: Run, p: Parameters, gain: float) -> FloatArray:
 
 
 def held(run: Run, renewals: int, skew: float, first: float) -> FloatArray:
-    """A sensor that renews its reading by its own clock, read by another one.
+    """A sensor that renews its reading by one clock, read by another one.
 
         measured(t_n) = x(P floor((t_n - t_0) / P) + t_0),   P = h (1 - skew) / m
 

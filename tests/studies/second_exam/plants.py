@@ -279,7 +279,7 @@ def mechanics(x: Floats, dt: float, p: Plant, h: Hidden) -> Floats:
         x = y
     if "contact" in h:  # a spring above one place, as a share of the stack's stiffness
         x = x - (x > h["contact"]["at"]) * (x - h["contact"]["at"]) * h["contact"]["share"]
-    if "mount" in h:  # the frame recoils on its own spring: b'' + 2 z w b' + w^2 b = -r x''
+    if "mount" in h:  # the frame recoils on a spring: b'' + 2 z w b' + w^2 b = -r x''
         w, q = 2 * np.pi * h["mount"]["f"], h["mount"]
         x = x - lti([q["mass"], 0, 0], [1, 2 * q["zeta"] * w, w * w], x, dt)
     if "play" in h:

@@ -56,7 +56,7 @@ class Half(NamedTuple):
 
 
 def cases_of(seed: int, count: int) -> list[Case]:
-    """Return so many cases in the order of the data set, which is random."""
+    """Return `count` cases in the order of the data set, which is random."""
     rng = np.random.default_rng(seed)
     numbers = {kind: round(share * count) for kind, share in SHARES.items()}
     numbers["known"] += count - sum(numbers.values())
