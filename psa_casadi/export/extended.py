@@ -175,7 +175,7 @@ def _first_outputs(part: FmuPart) -> list[float]:
     component, played = part.component, part.component.played
     if played is None:
         return [0.0 for _ in component.outputs]
-    values = {**dict(played.fixed), **part.values}
-    values |= {n: i.start for n, i in zip(played.inputs, component.inputs, strict=True)}
-    with part.fmu.start(CO_SIMULATION, values=values) as instance:
-        return [float(v) for v in instance.get(played.outputs)]
+    stepped = replace(played, interface=CO_SIMULATION)  # as what holds it steps it
+    starts = np.array([[i.start for i in component.inputs]])
+    (outputs,) = stepped.outputs_of([(part.model.values, starts)], np.zeros(1), "zero", 1)
+    return [float(v) for v in outputs[0]]
