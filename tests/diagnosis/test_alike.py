@@ -55,7 +55,7 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     one, other = (f.probability for f in cause.families)
     assert cause.confidence == pytest.approx(one, rel=1e-3)
     assert one == pytest.approx(other, rel=1e-3)
-    assert "no voltage below the resonances tells" in result.next_experiment.why
+    assert "no voltage below the resonances separates" in result.next_experiment.why
     output, _ = one_of_each(result.contenders, result.experiments)
     assert len(output) == 1
     with pytest.raises(InputError, match="bend the same curve"):
