@@ -19,10 +19,13 @@ _OURS = {**ONE_THREAD, "PSA_CASADI_THREADS": "1"}
 
 
 class Processes:
-    """An executor of `count` processes of this package, each with one thread."""
+    """An executor of `count` processes of this package, each with one thread.
 
-    def __init__(self, count: int) -> None:
-        self.count = count
+    A call whose process is lost runs `again` once, in a new process.
+    """
+
+    def __init__(self, count: int, *, again: bool = False) -> None:
+        self.count, self._again = count, again
         self._pool = ThreadPoolExecutor(count, thread_name_prefix="psa process")
         self._own, self._held, self._ended = threading.local(), ExitStack(), False
 
@@ -38,6 +41,14 @@ class Processes:
         self._held.close()
 
     def _called(self, function: Callable[[Any], Any], argument: Any) -> Any:
+        try:
+            return self._called_once(function, argument)
+        except MachineError:
+            if self._ended or not self._again:
+                raise
+        return self._called_once(function, argument)
+
+    def _called_once(self, function: Callable[[Any], Any], argument: Any) -> Any:
         child = cast("Child | None", getattr(self._own, "child", None))
         if child is None or child.poll() is not None:  # the process of this thread
             started = started_python("psa_casadi.processes", directory=None, **_OURS)

@@ -306,7 +306,7 @@ class _Runs:
             table: dict[str, FloatArray | str] = {k: self._kept[k] for k in by_key if k not in new}
         try:
             for key, future in new.items():
-                table[key] = self._result(future, by_key[key])
+                table[key] = _waited(future)
         except KeyboardInterrupt:
             self.end()
             raise
@@ -326,21 +326,9 @@ class _Runs:
     def _submitted(self, wanted: Run) -> "Future[Any]":
         self.count, self.samples = self.count + 1, self.samples + len(wanted.t)
         if self._processes is None:
-            self._processes = Processes(threads())
+            self._processes = Processes(threads(), again=True)
             atexit.register(self.end)
         return self._processes.submit(play, wanted)
-
-    def _result(self, future: "Future[Any]", wanted: Run) -> FloatArray | str:
-        """Return what comes of a run; once more where its process was lost."""
-        for last in (False, True):
-            try:
-                return _waited(future)
-            except MachineError as error:
-                if last:
-                    return str(error)
-            with self._lock:
-                future = self._submitted(wanted)
-        return ""
 
     def forget(self) -> None:
         """Forget the runs that were."""
@@ -354,10 +342,13 @@ class _Runs:
 
 
 def _waited(future: "Future[Any]") -> FloatArray | str:
-    """Return what comes of a run, in numbers or words. Raises MachineError, KeyboardInterrupt."""
+    """Return what comes of a run, in numbers or words. Raises KeyboardInterrupt."""
     while True:
         with suppress(TimeoutError):
-            result: FloatArray | str = future.result(timeout=_LOOK)
+            try:
+                result: FloatArray | str = future.result(timeout=_LOOK)
+            except MachineError as error:
+                return str(error)
             if isinstance(result, str):
                 return result
             return result if np.isfinite(result).all() else "its outputs are not finite"
