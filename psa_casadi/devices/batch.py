@@ -249,8 +249,7 @@ def batch(
     Raises:
         InputError: the jobs cannot be understood, or the results cannot be written.
         MachineError: the executor takes no more work; what is done is kept.
-        KeyboardInterrupt: the run was interrupted; what is done is kept, its message states how
-        much.
+        KeyboardInterrupt: the run was interrupted; its message states how much is done and kept.
     """
     began, o = time.monotonic(), options or Options()
     inputs = jobs_given(jobs)
