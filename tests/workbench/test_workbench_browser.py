@@ -18,14 +18,6 @@ pytestmark = pytest.mark.xdist_group("browser")
 DEMO = Path(__file__).parents[2] / "psa_casadi" / "data" / "demo.csv"
 #: A name that is markup where somebody takes it for that.
 HOSTILE = "<img src=x onerror=document.title=1>.csv"
-#: Leaves of the page what was tried, the verdict, and the top of the report.
-_FROM_THE_SEARCH = """
-  var away = 'main > :not(section), section:has(#h-files, #h-columns), #h-run ~ :not(#search),'
-    + ' #h-run, #printed, #downloads, #result .bar';
-  document.querySelectorAll(away).forEach(n => { n.style.display = 'none'; });
-  document.querySelector('#report').style.height = '740px';
-  scrollTo(0, 0);
-"""
 PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
 
 
@@ -52,15 +44,10 @@ def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **ho
 
 
 def pictures_of_the_result(tab: Steered) -> None:
-    """Save the page as it is, and from the search on: docs/pictures/web_diagnose_result.png."""
+    """Save the page as it is: all of it, on a phone, at night."""
     picture(tab, "result", height=3000)
     picture(tab, "phone", 390, 2600)
     picture(tab, "night", height=2200, dark=True)
-    if PICTURES:
-        tab.call("Emulation.setScrollbarsHidden", hidden=True)
-        tab.run(_FROM_THE_SEARCH)
-        for _ in range(3):  # the report is drawn again for another width, which takes a second
-            picture(tab, "web_diagnose_result", 500, 1350)
 
 
 def drop(tab: Steered, path: Path) -> None:

@@ -5,6 +5,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -31,9 +32,9 @@ class FmuPart:
     component: Component
     foreign: Foreign
 
-    @property
+    @cached_property
     def fmu(self) -> Fmu:
-        """The FMU as it is in its file now, unpacked once in a process."""
+        """The FMU as it is in its file, which is read and hashed once."""
         file = Path(self.foreign.place)
         return opened(file, digest_of(file))
 
