@@ -1,13 +1,9 @@
 """Hook of mkdocs: the page of commands is made from the command line itself."""
 
 import re
+import subprocess
+import sys
 from typing import Any
-
-import typer
-from typer.cli import get_docs_for_click
-from typer.main import get_command
-
-from psa_casadi.cli.app import app
 
 PAGE = "commands.md"
 
@@ -24,7 +20,6 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
 
 def commands() -> str:
     """Return every command with its arguments and options in Markdown."""
-    command = get_command(app)
-    context = typer.Context(command, info_name="psa")
-    text = get_docs_for_click(obj=command, ctx=context, name="psa")
+    line = [sys.executable, "-m", "typer", "psa_casadi.cli.app", "utils", "docs", "--name", "psa"]
+    text = subprocess.run(line, capture_output=True, text=True, check=True).stdout
     return _EXAMPLE.sub(r"Example: `\1`", _TITLE.sub("", _SHORTENED.sub("", text)))

@@ -20,14 +20,14 @@ from pathlib import Path
 import fmpy
 
 from build_scripts.measured_data import ROOT
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
 from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import STRICT, exported_texts
 from psa_casadi.export.nested import config_text
 from psa_casadi.export.web import WEB_FLAGS, module_texts
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.simulation.compiler import generate_c
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.split import split_of

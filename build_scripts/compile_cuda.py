@@ -14,9 +14,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS, stack_model
 from psa_casadi.simulation.device import OPTIONS, kernel_text
 from psa_casadi.simulation.simulate import SHOWN

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 
 from build_scripts.compile_cuda import models
-from psa_casadi.errors import MachineError
+from psa_casadi.common.errors import MachineError
 from psa_casadi.export.fmu.platforms import PLATFORMS, Platform, compile_library
 from psa_casadi.export.fmu.sources import exported_texts
 

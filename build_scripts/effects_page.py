@@ -9,12 +9,12 @@ from typing import Any
 import casadi as ca
 from mkdocs.structure.files import File, Files
 
-from psa_casadi.component import Component
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.remedy import example
 from psa_casadi.diagnosis.signature import signature
-from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES
+from psa_casadi.model.component import Component
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES
 from psa_casadi.model.ode_model import ode_model
 from psa_casadi.report.page.playground import playground
 from psa_casadi.report.plots.figures import save_signature, size_sentence

@@ -4,17 +4,17 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from build_scripts.effects_page import markdown_table
-from psa_casadi.component import Component
-from psa_casadi.components import COMPONENTS
 from psa_casadi.design.mechanism.mechanism import port_model
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.component import Component
+from psa_casadi.model.components import COMPONENTS
 from psa_casadi.model.compose import Model, Structure
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, part_model
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.model.variables import Input, Output
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.tables import Table
-from psa_casadi.variables import Input, Output
 
 PAGE = "ports.md"
 STACK = "P-885.51"

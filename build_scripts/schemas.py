@@ -6,8 +6,8 @@ from typing import Any
 
 import msgspec
 
-from psa_casadi.model.model_file import ModelFile
-from psa_casadi.report.documents.files import (
+from psa_casadi.common.strict_json import json_text
+from psa_casadi.documents.files import (
     CheckFile,
     DeviceFile,
     DiagnosisFile,
@@ -15,7 +15,7 @@ from psa_casadi.report.documents.files import (
     OwnModelFile,
     PosteriorFile,
 )
-from psa_casadi.strict_json import json_text
+from psa_casadi.model.model_file import ModelFile
 
 FOLDER = Path(__file__).resolve().parents[1] / "psa_casadi" / "data" / "schemas"
 

@@ -4,12 +4,9 @@ from psa_casadi import datasets as datasets
 from psa_casadi import design as design
 from psa_casadi import online as online
 from psa_casadi import system as system
-from psa_casadi.component import Component as Component
-from psa_casadi.component import Equations as Equations
-from psa_casadi.component import Symbols as Symbols
-from psa_casadi.components import BASE as BASE
-from psa_casadi.components import COMPONENTS as COMPONENTS
-from psa_casadi.components import SIMPLIFIED as SIMPLIFIED
+from psa_casadi.common.errors import InputError as InputError
+from psa_casadi.common.errors import MachineError as MachineError
+from psa_casadi.common.errors import PsaError as PsaError
 from psa_casadi.design.linear import Linear as Linear
 from psa_casadi.design.linear import linearize as linearize
 from psa_casadi.design.linear import margins as margins
@@ -24,10 +21,8 @@ from psa_casadi.devices.jobs import Options as Options
 from psa_casadi.diagnosis.result import Diagnosis as Diagnosis
 from psa_casadi.diagnosis.result import StackDiagnosis as StackDiagnosis
 from psa_casadi.diagnosis.verdict import patched_model as patched_model
-from psa_casadi.effects import EFFECTS as EFFECTS
-from psa_casadi.errors import InputError as InputError
-from psa_casadi.errors import MachineError as MachineError
-from psa_casadi.errors import PsaError as PsaError
+from psa_casadi.documents.files import load_diagnosis as load_diagnosis
+from psa_casadi.documents.findings import read_findings as read_findings
 from psa_casadi.export.check.check import CheckReport as CheckReport
 from psa_casadi.export.check.check import check_fmu as check_fmu
 from psa_casadi.export.extended import export_extended as export_extended
@@ -44,8 +39,15 @@ from psa_casadi.faces import identify as identify
 from psa_casadi.identification.identify import StackIdentification as StackIdentification
 from psa_casadi.identification.result import Identification as Identification
 from psa_casadi.identification.start.two_clocks import two_clocks as two_clocks
+from psa_casadi.model.component import Component as Component
+from psa_casadi.model.component import Equations as Equations
+from psa_casadi.model.component import Symbols as Symbols
+from psa_casadi.model.components import BASE as BASE
+from psa_casadi.model.components import COMPONENTS as COMPONENTS
+from psa_casadi.model.components import SIMPLIFIED as SIMPLIFIED
 from psa_casadi.model.compose import Model as Model
 from psa_casadi.model.compose import compose as compose
+from psa_casadi.model.effects import EFFECTS as EFFECTS
 from psa_casadi.model.model_file import save_model as save_model
 from psa_casadi.model.nanopositioner import controller_for as controller_for
 from psa_casadi.model.nanopositioner import margins_of as margins_of
@@ -60,6 +62,11 @@ from psa_casadi.model.stacks import stack_model as stack_model
 from psa_casadi.model.system import System as System
 from psa_casadi.model.system import connect as connect
 from psa_casadi.model.table import table as table
+from psa_casadi.model.variables import Input as Input
+from psa_casadi.model.variables import Output as Output
+from psa_casadi.model.variables import Parameter as Parameter
+from psa_casadi.model.variables import Publication as Publication
+from psa_casadi.model.variables import State as State
 from psa_casadi.online import AdaptiveFeedForward as AdaptiveFeedForward
 from psa_casadi.online import FeedForward as FeedForward
 from psa_casadi.online import HysteresisObserver as HysteresisObserver
@@ -76,8 +83,6 @@ from psa_casadi.records import read_signals as read_signals
 from psa_casadi.records import record_from as record_from
 from psa_casadi.records import write_record as write_record
 from psa_casadi.records.signals import Signals as Signals
-from psa_casadi.report.documents.files import load_diagnosis as load_diagnosis
-from psa_casadi.report.documents.findings import read_findings as read_findings
 from psa_casadi.report.page.devices import Comparison as Comparison
 from psa_casadi.report.page.devices import compare as compare
 from psa_casadi.report.page.devices import write_comparison as write_comparison
@@ -96,11 +101,6 @@ from psa_casadi.simulation.simulate import simulate_record as simulate_record
 from psa_casadi.simulation.stepper import run as run
 from psa_casadi.simulation.timings import Timings as Timings
 from psa_casadi.simulation.timings import timed as timed
-from psa_casadi.variables import Input as Input
-from psa_casadi.variables import Output as Output
-from psa_casadi.variables import Parameter as Parameter
-from psa_casadi.variables import Publication as Publication
-from psa_casadi.variables import State as State
 from psa_casadi.version import __version__ as __version__
 
 __all__: list[str]

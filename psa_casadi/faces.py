@@ -5,20 +5,20 @@ from functools import wraps
 from inspect import signature
 from typing import Any, overload
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.progress import Progress, on_a_terminal
 from psa_casadi.diagnosis import diagnose as diagnosis
 from psa_casadi.diagnosis.ode import diagnose_ode
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.task import Method
-from psa_casadi.errors import InputError
 from psa_casadi.identification import identify as stack
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.own_model import identify_ode
 from psa_casadi.identification.result import Identification
 from psa_casadi.identification.start.ordinary import Hysteresis
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.progress import Progress, on_a_terminal
 from psa_casadi.records.read.reading import Records
 from psa_casadi.records.signals import Hold
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra

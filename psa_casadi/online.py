@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.components import COMPONENTS
-from psa_casadi.components.online_identification import (
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.model.component import Component
+from psa_casadi.model.components import COMPONENTS
+from psa_casadi.model.components.online_identification import (
     ADAPTIVE_FEED_FORWARD,
     COUNT,
     FEED_FORWARD,
@@ -20,7 +21,6 @@ from psa_casadi.components.online_identification import (
     estimates,
     variances,
 )
-from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.nanopositioner import nanopositioner
 from psa_casadi.model.parts import PARTS, compensator_for, part_model
@@ -267,8 +267,8 @@ class OnlineIdentification(_Learning):
 
     A streaming object: one sample in, one out. `values` are the parameters of the component of the
     same name, for instance `identifier_for(model, period, noise=...).values`. See
-    `psa_casadi.components.online_identification` for the equations and for what is done while the
-    voltage is held.
+    `psa_casadi.model.components.online_identification` for the equations and for what is done while
+    the voltage is held.
     """
 
     _component = ONLINE_IDENTIFICATION

@@ -25,8 +25,8 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from psa_casadi.errors import Problems
-from psa_casadi.units import FloatArray
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.units import FloatArray
 
 Signal = Callable[[float], float]
 Mechanics = Literal["cascade", "single_mass"]

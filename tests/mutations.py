@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 
 
 def sentences(call: Callable[[], object]) -> tuple[str, ...]:

@@ -10,13 +10,13 @@ from xml.etree import ElementTree as ET
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.characters import check_text, plain, visible
 from psa_casadi.cli.screen import show_table
+from psa_casadi.common.characters import check_text, plain, visible
+from psa_casadi.common.files import atomic_write
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.files import atomic_write
 from psa_casadi.report.page.document import render
 from psa_casadi.report.words.tables import Table
 from tests.contract.helpers import command

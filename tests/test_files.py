@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from psa_casadi import files
-from psa_casadi.children import run_child
-from psa_casadi.errors import InputError, Problems, PsaError
-from psa_casadi.files import (
+from psa_casadi.common import files
+from psa_casadi.common.children import run_child
+from psa_casadi.common.errors import InputError, Problems, PsaError
+from psa_casadi.common.files import (
     atomic_path,
     atomic_write,
     sweep,
@@ -107,7 +107,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of
 #: Makes a folder and a half-written file in a place, prints "ready", and waits to be killed.
 HOLDS = """
 import pathlib, sys, time
-from psa_casadi.files import temporary_file, temporary_folder
+from psa_casadi.common.files import temporary_file, temporary_folder
 place = pathlib.Path(sys.argv[1])
 with temporary_folder(place) as folder, temporary_file(place, "model.json") as file:
     (folder / "inner").mkdir()
@@ -244,8 +244,8 @@ def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) 
 #: Gets SIGTERM when its child runs, and `Popen` has not returned yet.
 STARTS = """
 import os, subprocess, sys
-from psa_casadi.children import started
-from psa_casadi.files import answer_requests_to_end
+from psa_casadi.common.children import started
+from psa_casadi.common.files import answer_requests_to_end
 popen = subprocess.Popen
 def ended_at_once(*arguments, **options):
     child = popen(*arguments, **options)
@@ -271,7 +271,7 @@ def test_a_child_that_is_just_being_started_is_ended_too() -> None:
 #: Gets SIGTERM in a block that answers, or after it.
 TERMINATED = """
 import os, pathlib, sys
-from psa_casadi.files import requests_to_end_answered, temporary_folder
+from psa_casadi.common.files import requests_to_end_answered, temporary_folder
 with requests_to_end_answered(), temporary_folder(pathlib.Path(sys.argv[1])):
     if sys.argv[2] == "inside":
         os.kill(os.getpid(), 15)

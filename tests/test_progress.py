@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.progress import on_a_terminal, silent
+from psa_casadi.common.progress import on_a_terminal, silent
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
 

@@ -18,11 +18,11 @@ import pytest
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
-from psa_casadi.component import OnDemand
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.identification.own_model import identify_ode
+from psa_casadi.model.component import OnDemand
 from psa_casadi.records.read.reading import records_given
-from psa_casadi.units import FloatArray
 from tests.any_model.own_models import oscillator
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow

@@ -9,7 +9,7 @@ from threading import Thread
 
 import casadi as ca
 
-from psa_casadi.symbolic import in_turn
+from psa_casadi.common.symbolic import in_turn
 
 
 @in_turn

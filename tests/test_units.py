@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psa_casadi.errors import InputError
-from psa_casadi.units import (
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import (
     UNITS,
     Power,
     Unit,

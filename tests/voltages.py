@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 
 def steps(time: FloatArray, levels: ArrayLike) -> FloatArray:

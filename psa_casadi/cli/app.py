@@ -25,7 +25,7 @@ from psa_casadi.cli.options import command
 from psa_casadi.cli.sample import sample
 from psa_casadi.cli.simulate import simulate
 from psa_casadi.cli.web import web
-from psa_casadi.progress import typed
+from psa_casadi.common.progress import typed
 from psa_casadi.version import __version__
 
 _group = partial(typer.Typer, no_args_is_help=True, rich_markup_mode=None)

@@ -11,7 +11,7 @@ from psa_casadi.cli.failures import Case, judge
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName
 from psa_casadi.cli.screen import show, show_table, show_written, working
-from psa_casadi.files import atomic_write
+from psa_casadi.common.files import atomic_write
 
 
 def check(
@@ -53,10 +53,10 @@ def check(
     Example:
         psa check stack.fmu --model extended.json
     """
-    from psa_casadi.report.documents.files import check_file
+    from psa_casadi.common.strict_json import json_text
+    from psa_casadi.documents.files import check_file
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
-    from psa_casadi.strict_json import json_text
 
     began = time.perf_counter()
     inputs.outputs({"--json": json, "--junit": junit}, [fmu, model])

@@ -10,8 +10,8 @@ import typer
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, show, show_table, width, working
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write, make_folder
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write, make_folder
 
 RECORD = "synthetic_record.csv"
 FILES = {

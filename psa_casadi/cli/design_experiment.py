@@ -11,7 +11,7 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 
 #: Samples of a record by default.
 _SAMPLES = 1000

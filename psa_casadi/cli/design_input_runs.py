@@ -10,6 +10,7 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi.cli.failures import kept
 from psa_casadi.cli.screen import show_results, show_written, working
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking import targets
 from psa_casadi.design.tracking.inversion import corrected
 from psa_casadi.design.tracking.inversion import invert as inverted
@@ -21,7 +22,6 @@ from psa_casadi.report.page.document import Picture
 from psa_casadi.report.page.live import live_design
 from psa_casadi.report.words.design_words import Titled, error_table, limits_table
 from psa_casadi.report.words.phrases import number
-from psa_casadi.units import FloatArray
 
 _Rows = list[tuple[str, targets.TrackingError]]
 

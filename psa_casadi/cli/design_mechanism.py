@@ -7,7 +7,7 @@ import psa_casadi as psa
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.screen import show_results, show_written, working
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 
 
 def mechanism(

@@ -8,11 +8,11 @@ from pathlib import Path
 import psa_casadi as psa
 from psa_casadi.cli.failures import Case, kept
 from psa_casadi.cli.inputs import Inputs, meant
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.files import atomic_write
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.errors import PsaError
-from psa_casadi.files import atomic_write
 from psa_casadi.records import write_record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number

@@ -15,8 +15,8 @@ from psa_casadi.cli.inputs import Inputs, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write, make_folder
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write, make_folder
 
 #: The stack of a system without a model.
 DEFAULT_STACK = "P-885.51"

@@ -20,19 +20,19 @@ from typing import NoReturn, ParamSpec
 
 import typer
 
-from psa_casadi.cache import sweep_rooms
-from psa_casadi.characters import plain
 from psa_casadi.cli import INTERRUPTED
 from psa_casadi.cli.screen import print_message
-from psa_casadi.errors import InputError, MachineError, PsaError
-from psa_casadi.files import (
+from psa_casadi.common.cache import sweep_rooms
+from psa_casadi.common.characters import plain
+from psa_casadi.common.errors import InputError, MachineError, PsaError
+from psa_casadi.common.files import (
     abandon,
     answer_requests_to_end,
     atomic_write,
     temporary_folder,
     written,
 )
-from psa_casadi.interruption import Work, interruptible_work
+from psa_casadi.common.interruption import Work, interruptible_work
 
 _SHOW_CURSOR = "\x1b[?25h"
 
@@ -42,8 +42,8 @@ def interrupts() -> Iterator[None]:
     """Let Ctrl-C end what runs inside, compiled code and other threads too; also a decorator.
 
     Python's own handler waits until the main thread is back from C. Here a thread that the signal
-    wakes at once sets the flag of the work (`psa_casadi.interruption`). Outside the main thread of
-    a process nothing changes.
+    wakes at once sets the flag of the work (`psa_casadi.common.interruption`). Outside the main
+    thread of a process nothing changes.
     """
     with interruptible_work() as work:
         if threading.current_thread() is not threading.main_thread():

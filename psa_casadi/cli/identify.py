@@ -11,7 +11,7 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import IDENTIFY, print_message, show, show_written, width, working
-from psa_casadi.files import atomic_write
+from psa_casadi.common.files import atomic_write
 
 if TYPE_CHECKING:
     from psa_casadi.identification.profile import Profile
@@ -129,9 +129,9 @@ def _finish(
 
     `page` is the origin of the records, and whether the page is still.
     """
+    from psa_casadi.common.strict_json import json_text
+    from psa_casadi.documents.files import identification_file
     from psa_casadi.identification.profile import profile
-    from psa_casadi.report.documents.files import identification_file
-    from psa_casadi.strict_json import json_text
 
     output, json, report = outputs.values()
     done: list[Path] = []

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import psa_casadi as psa
 from psa_casadi.cli.options import Published, Reading, Start
 from psa_casadi.cli.screen import print_message, set_quiet
-from psa_casadi.errors import InputError
-from psa_casadi.files import why_not_written
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import why_not_written
 
 if TYPE_CHECKING:
     from psa_casadi.records.read.columns import ColumnMap
@@ -294,7 +294,7 @@ def step_seconds(text: str) -> float:
 
     Raises InputError for anything else.
     """
-    from psa_casadi.units import parse_unit, to_si, units_of
+    from psa_casadi.common.units import parse_unit, to_si, units_of
 
     match = re.fullmatch(r"\s*(?P<number>[-+]?[0-9.]+(?:[eE][-+]?[0-9]+)?)\s*(?P<unit>\D*)", text)
     try:

@@ -12,8 +12,8 @@ import psa_casadi as psa
 from psa_casadi.cli import screen
 from psa_casadi.cli.inputs import Inputs, similar
 from psa_casadi.cli.options import names
-from psa_casadi.errors import InputError
-from psa_casadi.files import make_folder
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import make_folder
 
 
 def effects(
@@ -38,7 +38,7 @@ def effects(
     """
     from psa_casadi.diagnosis.remedy import example
     from psa_casadi.diagnosis.signature import signature
-    from psa_casadi.effects.mechanics import MODAL_SERIES
+    from psa_casadi.model.effects.mechanics import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.plots.figures import save_signature
     from psa_casadi.report.words.tables import effects_table

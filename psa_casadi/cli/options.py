@@ -103,7 +103,7 @@ def _declared(p: inspect.Parameter, helps: dict[str, str]) -> inspect.Parameter:
 #: Where the names of each kind are; a module loads when it is needed.
 _KNOWN = {
     "stacks": ("psa_casadi.model.stacks", "STACKS"),
-    "effects": ("psa_casadi.effects", "EFFECTS"),
+    "effects": ("psa_casadi.model.effects", "EFFECTS"),
     "parts": ("psa_casadi.model.parts", "PARTS"),
     "datasets": ("psa_casadi.datasets", "DATASETS"),
     "examples": ("psa_casadi.examples.index", "examples"),

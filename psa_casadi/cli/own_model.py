@@ -12,7 +12,7 @@ from typing import Any, Literal
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading
-from psa_casadi.errors import InputError, quoted
+from psa_casadi.common.errors import InputError, quoted
 
 _PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
 

@@ -12,7 +12,7 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Origin, Reading, StackName
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, width, working
-from psa_casadi.files import atomic_write
+from psa_casadi.common.files import atomic_write
 
 
 def sample(
@@ -57,10 +57,10 @@ def sample(
     Example:
         psa sample record.csv --model model.json -o posterior.nc --figure posterior.png
     """
-    from psa_casadi.report.documents.files import posterior_file
+    from psa_casadi.common.strict_json import json_text
+    from psa_casadi.documents.files import posterior_file
     from psa_casadi.report.plots.figures import posterior_figure, write_figure
     from psa_casadi.report.words.text import posterior_text
-    from psa_casadi.strict_json import json_text
 
     if (model, stack) == (None, None) and len(records) > 1 and records[0].suffix == ".json":
         model, *records = records  # as it was written before there was --model here

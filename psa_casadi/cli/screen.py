@@ -17,8 +17,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from psa_casadi.characters import visible
-from psa_casadi.errors import InputError
+from psa_casadi.common.characters import visible
+from psa_casadi.common.errors import InputError
 
 if TYPE_CHECKING:
     from psa_casadi.diagnosis.task import Tried

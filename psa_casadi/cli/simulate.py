@@ -11,9 +11,9 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, working
-from psa_casadi.display import with_units
-from psa_casadi.errors import Problems
-from psa_casadi.units import FloatArray, convert
+from psa_casadi.common.display import with_units
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.units import FloatArray, convert
 
 
 def simulate(

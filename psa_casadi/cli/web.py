@@ -15,12 +15,12 @@ from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import print_message, show_always, show_written, working
-from psa_casadi.errors import InputError
-from psa_casadi.files import temporary_folder
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import temporary_folder
 
 if TYPE_CHECKING:
     import psa_casadi as psa
-    from psa_casadi.workbench.previews import Subject
+    from psa_casadi.cli.workbench.previews import Subject
 
 
 def web(
@@ -84,7 +84,7 @@ def web(
 
 def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> "Subject":
     """Return the subject of the page: a stack, or any other model."""
-    from psa_casadi.workbench.previews import Subject
+    from psa_casadi.cli.workbench.previews import Subject
 
     if model is None:
         return Subject()
@@ -104,9 +104,9 @@ def _subject(model: "psa.Model | None", path: Path | None, fitting: Fitting) -> 
 
 def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Inputs) -> None:
     """Serve the page until Ctrl-C; its files are removed then."""
+    from psa_casadi.cli.workbench.desk import Desk
+    from psa_casadi.cli.workbench.server import served
     from psa_casadi.model.own_effects import known_effects
-    from psa_casadi.workbench.desk import Desk
-    from psa_casadi.workbench.server import served
 
     modules = inputs.effects or []
     here = str(Path.cwd())  # children look for named modules there, and for nothing else

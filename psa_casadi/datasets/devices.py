@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.units import ComplexArray, FloatArray
+from psa_casadi.common.units import ComplexArray, FloatArray
 
 
 def _beside(name: str) -> str:

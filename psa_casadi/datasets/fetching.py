@@ -5,10 +5,10 @@ import hashlib
 import os
 from pathlib import Path
 
-from psa_casadi.cache import writable_room
+from psa_casadi.common.cache import writable_room
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.files import atomic_write, make_folder
 from psa_casadi.datasets.devices import DATASETS, Dataset, DatasetFile, Original
-from psa_casadi.errors import InputError, PsaError
-from psa_casadi.files import atomic_write, make_folder
 
 #: Names the folder with the records of a machine that downloads nothing.
 DATA_VARIABLE = "PSA_CASADI_DATA"

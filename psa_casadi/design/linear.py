@@ -14,15 +14,15 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.display import Celled
-from psa_casadi.errors import InputError, PsaError, quoted
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.common.display import Celled
+from psa_casadi.common.errors import InputError, PsaError, quoted
+from psa_casadi.common.files import atomic_path, atomic_write
+from psa_casadi.common.strict_json import json_text
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ode_model import ode_model
+from psa_casadi.model.variables import Input, Output, State, nominal_value
 from psa_casadi.simulation.start import is_stack, start_state
-from psa_casadi.strict_json import json_text
-from psa_casadi.units import ComplexArray, FloatArray
-from psa_casadi.variables import Input, Output, State, nominal_value
 
 #: What a rate may be at rest, over the largest usual size of its row.
 _REST = 1e-9

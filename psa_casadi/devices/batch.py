@@ -25,7 +25,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_path, atomic_write, make_folder
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.processes import Processes
+from psa_casadi.common.progress import Progress, on_a_terminal, silent
+from psa_casadi.common.strict_json import decode, json_text, read_json
 from psa_casadi.devices.executors import Executor, make_ready, outcomes
 from psa_casadi.devices.jobs import (
     DeviceOutcome,
@@ -36,17 +41,12 @@ from psa_casadi.devices.jobs import (
     jobs_given,
     key_of,
 )
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_path, atomic_write, make_folder
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.documents.files import DEVICE_FORMAT as FORMAT
+from psa_casadi.documents.files import DeviceFile, DeviceRecord, damage, hash_of
+from psa_casadi.documents.findings import DEVICE_FILE, device_finding, finding_content
+from psa_casadi.model.component import Component
 from psa_casadi.model.own_effects import own_effects
 from psa_casadi.population.finding import Finding
-from psa_casadi.processes import Processes
-from psa_casadi.progress import Progress, on_a_terminal, silent
-from psa_casadi.report.documents.files import DEVICE_FORMAT as FORMAT
-from psa_casadi.report.documents.files import DeviceFile, DeviceRecord, damage, hash_of
-from psa_casadi.report.documents.findings import DEVICE_FILE, device_finding, finding_content
-from psa_casadi.strict_json import decode, json_text, read_json
 from psa_casadi.version import __version__
 
 

@@ -4,8 +4,8 @@ The work runs in any process or thread, on one thread, with its error as result.
 
 An executor is any object with `submit(function, argument)` that returns a future with
 `add_done_callback`, `result` and `cancel`: those of `concurrent.futures`, a client of Dask,
-mpi4py's. `psa_casadi.processes.Processes` is one, too: of it, a process that dies takes one device
-with it instead of all.
+mpi4py's. `psa_casadi.common.processes.Processes` is one, too: of it, a process that dies takes one
+device with it instead of all.
 """
 
 import asyncio
@@ -18,19 +18,19 @@ from contextlib import ExitStack, contextmanager, suppress
 from importlib import import_module
 from typing import Any, Protocol, cast
 
+from psa_casadi.common.errors import InputError, MachineError, PsaError
+from psa_casadi.common.interruption import Work, interruptible_work, raise_if_stopped
+from psa_casadi.common.processes import ONE_THREAD
+from psa_casadi.common.progress import silent
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, Job, Options
-from psa_casadi.errors import InputError, MachineError, PsaError
+from psa_casadi.documents.files import Status
 from psa_casadi.faces import diagnose, identify
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.interruption import Work, interruptible_work, raise_if_stopped
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.own_effects import known_effects, own_effects
-from psa_casadi.processes import ONE_THREAD
-from psa_casadi.progress import silent
 from psa_casadi.records import Record, read_records, read_signals
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.documents.files import Status
 from psa_casadi.simulation.side_by_side import compiled, one_thread
 from psa_casadi.simulation.start import is_stack
 

@@ -21,13 +21,13 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.characters import plain
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.characters import plain
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.documents.files import Status, Work
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import declaration_hash
 from psa_casadi.records.read.formats import READERS
-from psa_casadi.report.documents.files import Status, Work
 from psa_casadi.version import __version__
 
 COLUMNS = ("device", "batch", "date", "files")

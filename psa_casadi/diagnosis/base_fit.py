@@ -17,23 +17,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.progress import Progress
+from psa_casadi.common.units import FloatArray, IndexArray
 from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.mechanics import force_of, retuned, without_blur
 from psa_casadi.identification.refitting import quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
 from psa_casadi.identification.start.starting_points import linear_start, resolved
-from psa_casadi.progress import Progress
+from psa_casadi.model.component import Component
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray, IndexArray
 
 #: Tones and decay rates that are tried, over the sampling rate.
 _TONES, _DECAYS = np.arange(0.04, 0.501, 0.02), (0.03, 0.06, 0.12, 0.25)

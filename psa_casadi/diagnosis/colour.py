@@ -6,12 +6,12 @@ from functools import cached_property
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import with_noise
 from psa_casadi.records.noise import filtered, first_order_noise, uncertain
 from psa_casadi.records.repeats import autoregression_of
 from psa_casadi.records.split import Experiment, noise_share
-from psa_casadi.units import FloatArray
 
 #: Correlations below this are taken as white: estimated ones of white noise are not exactly 0.
 _WHITE = 0.05

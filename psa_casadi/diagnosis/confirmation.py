@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import rms
 from psa_casadi.diagnosis.held_out import Gain, held_out_residuals
 from psa_casadi.diagnosis.noise import NoiseFloor, detection_limit_of
@@ -13,10 +15,8 @@ from psa_casadi.diagnosis.own_colour import OwnColour
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
-from psa_casadi.notes import Note, note
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment, Kind, counts
-from psa_casadi.units import FloatArray
 
 #: Gain [%] of an error that doubles.
 _DOUBLED = -100.0

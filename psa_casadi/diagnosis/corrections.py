@@ -26,24 +26,24 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.held_out import held_out_rms
 from psa_casadi.diagnosis.screening import independent, temperature, without
 from psa_casadi.diagnosis.task import LIMITS, Thresholds, shows_ringing
-from psa_casadi.effects import patches
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import POLISH
 from psa_casadi.identification.start.linear_response import plays
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
+from psa_casadi.model.effects import patches
 from psa_casadi.records.noise import filtered
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.start import linear_part
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 
 #: Relaxations per decade, modes.
 _PER_DECADE, MODES = 2, 24

@@ -6,7 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.judgement import NAMING, indistinguishable
 from psa_casadi.diagnosis.noise import without_stuck_readings
@@ -19,7 +23,6 @@ from psa_casadi.diagnosis.search.best_first import best_first
 from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify, unfinished
@@ -38,11 +41,9 @@ from psa_casadi.identification.search import (
 from psa_casadi.identification.start import doubts
 from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.own_effects import known_effects
-from psa_casadi.notes import Note, note, texts
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
@@ -50,7 +51,6 @@ from psa_casadi.records.split import Experiment, divided, excerpts, in_one_order
 from psa_casadi.records.suspects import cleaned, suspects
 from psa_casadi.simulation.side_by_side import compiled_ahead, one_thread_of_algebra
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
 
 #: A voltage with less of its variance about a parabola over time is not separated from a drift.
 _TREND = 0.05

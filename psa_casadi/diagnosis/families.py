@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.component import Kind
 from psa_casadi.diagnosis.corrections import Correction, Patch
 from psa_casadi.diagnosis.task import Thresholds
+from psa_casadi.model.component import Kind
 
 #: What a correction of a kind does, where it has another name, and the places of its ports.
 _DOES: dict[str, Kind] = {

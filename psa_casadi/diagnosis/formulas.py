@@ -18,19 +18,19 @@ from math import prod
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray, per
 from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, size_at
 from psa_casadi.diagnosis.probes import tangents
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import refit, weighted
+from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, true_sum, unit_of, variables_at
+from psa_casadi.model.variables import Parameter
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.units import FloatArray, per
-from psa_casadi.variables import Parameter
 
 #: Factors of a product, terms of a formula, variables that it may have.
 _FACTORS, _TERMS, _VARIABLES = 3, 3, 4

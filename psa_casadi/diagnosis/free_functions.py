@@ -13,7 +13,8 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Expression, Symbols
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.corrections import FreeFunction, estimates
 from psa_casadi.diagnosis.formulas import Formula, Place, fitted, formula, place_of
@@ -21,17 +22,16 @@ from psa_casadi.diagnosis.generic.attached import Attached, extended
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.parts import fit_longer_parts, follows
 from psa_casadi.identification.result import with_origin
+from psa_casadi.model.component import Component, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import is_place, ports_of
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of, states_of
-from psa_casadi.units import FloatArray
 
 #: Number of ports that are fitted.
 _FITTED = 2

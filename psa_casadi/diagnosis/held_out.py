@@ -21,10 +21,10 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import Experiment, counted
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Fewest held-out records that serve as the parts; number of blocks of each that do otherwise.
 FEWEST_RECORDS, _BLOCKS = 4, 8

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import noise_left, noise_told
 from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
@@ -32,11 +33,10 @@ from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.search.steps import Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.result import EXCESSIVE
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 from psa_casadi.records.split import Experiment, missed_rms
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
 
 #: Verdicts that name causes.
 NAMING: tuple[Verdict, ...] = ("cause_named", "partly_explained", "ambiguous")

@@ -5,16 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis import views
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.views import View
-from psa_casadi.errors import InputError
-from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import drive_frequency
 from psa_casadi.records.noise import lines_in
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import repetitions
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Points of the spectrum that are kept; lines that are listed.
 _POINTS, LINES = 300, 6

@@ -7,16 +7,16 @@ from typing import Literal
 
 import numpy as np
 
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import first_order_noise, last_place_of, quantum_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import MeasuredNoise, holds, repeats
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 
 Source = Literal["repeats", "holds", "fast part"]
 

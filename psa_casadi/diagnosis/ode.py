@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.notes import Note, note
 from psa_casadi.diagnosis.free_functions import model_of
 from psa_casadi.diagnosis.generic.attached import Attached, of_ones_own
 from psa_casadi.diagnosis.generic.of_rates import effects_of
@@ -21,7 +22,6 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.moves import fit_rivals
 from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Method, Tried
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.experiments import (
     column_notes,
     experiments_of,
@@ -51,9 +51,9 @@ from psa_casadi.identification.parts import (
 )
 from psa_casadi.identification.refitting import reweighted, unlike, with_noise
 from psa_casadi.identification.result import noise_found
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import parameter_ports, ports_of, with_ports
-from psa_casadi.notes import Note, note
 from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sizes_of

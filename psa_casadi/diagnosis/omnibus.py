@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 import scipy
 
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
-from psa_casadi.notes import Note, note
-from psa_casadi.units import FloatArray
 
 #: Neighbours correlate, the spectrum has a line, the residual or its size follows the drive, or
 #: the residual what some effect would add.

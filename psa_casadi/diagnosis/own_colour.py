@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.records.noise import growth, runs_of
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Orders of an autoregression that a residual may have, and samples that each of its terms needs.
 _ORDERS, _EACH = (0, 1, 2, 4, 8, 16), 20

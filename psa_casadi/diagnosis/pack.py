@@ -5,19 +5,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.component import DISPLACEMENT_PEAKS, Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, noise_rms
 from psa_casadi.diagnosis.noise import detection_limit_of
 from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.component import DISPLACEMENT_PEAKS, Component
 from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import linear_part
-from psa_casadi.units import FloatArray
 
 #: Terms of a static curve.
 _CURVE = 8

@@ -20,17 +20,18 @@ from itertools import product
 import numpy as np
 import scipy
 
-from psa_casadi.component import (
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
+from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import measured, outputs_of, trace_record
+from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
+from psa_casadi.model.component import (
     DISPLACEMENT_PEAKS,
     DISPLACEMENT_STEPS,
     RECORD_DURATION,
     SPECTRAL_PEAKS,
     Component,
 )
-from psa_casadi.errors import PsaError
-from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, outputs_of, trace_record
-from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.noise import peaks as highest_peaks
@@ -41,7 +42,6 @@ from psa_casadi.simulation.exact.run import NotExact, time_steps
 from psa_casadi.simulation.side_by_side import compiled, side_by_side
 from psa_casadi.simulation.simulate import Way, record_inputs
 from psa_casadi.simulation.start import is_stack, memory_names
-from psa_casadi.units import FloatArray
 
 #: Peaks that are tried, and how much finer than 1/duration their frequencies are resolved.
 _PEAKS, _FINER = 4, 8

@@ -16,16 +16,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from psa_casadi.component import Expression
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray, rate_unit
 from psa_casadi.diagnosis.colour import Colour, rms
 from psa_casadi.diagnosis.own_colour import Entering, OwnColour, price_of, windows
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.tangent import Along, course_of
-from psa_casadi.units import BoolArray, FloatArray, IndexArray, rate_unit
 
 #: Powers of what noise makes of an output over the sensor's that are tried, and its times of
 #: correlation over a record's duration: 0 is white, the last one a walk.

@@ -23,21 +23,21 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.notes import note
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis.corrections import KINDS, Signals, responses, time_constants
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.task import Method
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.refitting import noise_levels
-from psa_casadi.notes import note
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Forms that follow the voltage, at their ports. Others go with the time of a record.
 _FORMS = (

@@ -21,17 +21,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.signature import STACK, standard_voltage
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import accurate, input_samples, output_of, record_inputs
 from psa_casadi.simulation.start import linear_part, start_on
-from psa_casadi.units import FloatArray
 
 #: When a hold is looked at [s] after its step, and how long the step takes [s].
 _HELD, _STEP = (10.0, 600.0), 0.02

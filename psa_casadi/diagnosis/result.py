@@ -7,20 +7,20 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
+from psa_casadi.common.display import Reported, frame, made, with_units
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.corrections import Correction, Estimate, FreeFunction, Patch
 from psa_casadi.diagnosis.families import Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.display import Reported, frame, made, with_units
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 
 Verdict = Literal[
     "adequate", "cause_named", "partly_explained", "ambiguous", "unexplained", "not_driven"

@@ -24,12 +24,12 @@ from itertools import combinations
 import numpy as np
 import scipy
 
+from psa_casadi.common.units import FloatArray, IndexArray
 from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
-from psa_casadi.units import FloatArray, IndexArray
 
 _DRAWS = 4000
 _SEED = 20150810  # of the threshold's simulation: the same data give the same verdict

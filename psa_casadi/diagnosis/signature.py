@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.component import SPECTRAL_PEAKS, Component
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis import views
+from psa_casadi.model.component import SPECTRAL_PEAKS, Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 
 STACK = "P-885.51"
 #: Period [s] of the slow loops of the standard voltage, for the slow play and the quick one.

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from psa_casadi.component import Component
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.component import Component
 from psa_casadi.records.split import Experiment, fitted
 
 

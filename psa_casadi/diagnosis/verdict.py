@@ -11,7 +11,9 @@ from functools import cached_property
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis import held_out
 from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
@@ -34,22 +36,20 @@ from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.steps import Step, contenders
 from psa_casadi.diagnosis.task import Thresholds, same_curves
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import ErrorBudget, ErrorShare, HeldOut
-from psa_casadi.notes import Note, note
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import held, repeats
 from psa_casadi.records.split import Experiment, counts, loop_sizes
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import BoolArray, FloatArray
-from psa_casadi.variables import Interval
 
 
 def blind_spots(

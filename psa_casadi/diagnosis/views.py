@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
+from psa_casadi.common.units import FloatArray, IndexArray
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import correlation_inflation, fast_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import held
-from psa_casadi.units import FloatArray, IndexArray
 
 #: Most bins of a view, bins of a decade on a logarithmic axis, fewest samples of a bin.
 BINS, PER_DECADE, FEWEST = 24, 5, 8

@@ -17,7 +17,7 @@ from fmpy.fmi2 import FMU2Slave
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 #: The voltage rises by 0.2 V per microsecond; the coupled parts are run for 0.4 ms.
 END, RATE = 4e-4, 2e5

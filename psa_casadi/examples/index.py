@@ -13,8 +13,8 @@ from functools import cache
 from importlib import import_module, resources
 from pathlib import Path
 
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write
 
 _PACKAGE = "psa_casadi.examples"
 _NOT_EXAMPLES = ("index", "linearisation_trial")

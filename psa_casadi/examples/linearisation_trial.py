@@ -18,8 +18,8 @@ import numpy as np
 import scipy
 
 from psa_casadi import online
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
 

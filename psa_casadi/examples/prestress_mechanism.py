@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.mechanism.loop import Mounting, step_response
 from psa_casadi.design.mechanism.mechanism import (
     Limits,
@@ -24,7 +25,6 @@ from psa_casadi.design.mechanism.mechanism import (
     root_locus,
 )
 from psa_casadi.examples.co_simulation import Slave
-from psa_casadi.units import FloatArray
 
 END, STEP = 5e-4, 1e-7
 _MOTION = ("displacement", "tip_velocity", "tip_acceleration")

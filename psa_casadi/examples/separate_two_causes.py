@@ -21,7 +21,7 @@ from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import StackDiagnosis
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, write_record
 from psa_casadi.records.signals import Signals

@@ -14,7 +14,7 @@ from fmpy import extract
 from matplotlib.figure import Figure
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 #: The path to follow: a smooth rise of 8 um in 0.4 ms, in 20 steps.
 STEPS, SIZE = 20, 2e-5

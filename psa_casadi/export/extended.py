@@ -11,19 +11,19 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, OnDemand, Symbols
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_path, temporary_folder
 from psa_casadi.export import ssp
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION
 from psa_casadi.export.importer.played import GIVEN, PLAYED
 from psa_casadi.export.importer.start_values import FmuPart, fmu_part, start_set
 from psa_casadi.export.nested import nested
-from psa_casadi.files import atomic_path, temporary_folder
+from psa_casadi.model.component import Component, Equations, OnDemand, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Opened, ported
+from psa_casadi.model.variables import Input, Output, State
 from psa_casadi.simulation.start import start_for
-from psa_casadi.variables import Input, Output, State
 
 _BEFORE, _ORIGINAL, _BEHIND = "before", "original", "behind"
 _PARAMETERS = "resources/original.ssv"

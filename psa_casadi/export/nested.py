@@ -17,12 +17,12 @@ from fmpy.model_description import (
     write_model_description,
 )
 
+from psa_casadi.common.files import temporary_folder
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.fmu.platforms import Platform, compile_library, host_platform
 from psa_casadi.export.fmu.sources import FMI_HEADERS
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.ssp import OUTSIDE, Port, WiredParts
-from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import sources_directory
 
 _IDENTIFIER = "nested"

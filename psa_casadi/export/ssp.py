@@ -19,17 +19,17 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from psa_casadi.characters import check_text
-from psa_casadi.errors import InputError
+from psa_casadi.common.characters import check_text
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_path, temporary_folder
+from psa_casadi.common.units import FloatArray, parse_unit
 from psa_casadi.export.common import markup
 from psa_casadi.export.common.parameter_sets import Row, parameter_rows, set_text
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
-from psa_casadi.files import atomic_path, temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.model.system import System
-from psa_casadi.units import FloatArray, parse_unit
-from psa_casadi.variables import Publication
+from psa_casadi.model.variables import Publication
 
 Point = tuple[float, float]
 

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import casadi as ca
 
-from psa_casadi.cache import cached
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.common.cache import cached
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.symbolic import in_turn
 from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import (
@@ -45,7 +46,6 @@ from psa_casadi.simulation.simulate import (
     TIGHTEST,
 )
 from psa_casadi.simulation.stepper import SOURCES
-from psa_casadi.symbolic import in_turn
 
 _PAGE_SOURCES = ("page/page.c", "page/settle.c", "page/library.c")
 #: What a page calls, and how many bytes of stack it has.

@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from psa_casadi.display import Worded
-from psa_casadi.errors import PsaError
+from psa_casadi.common.display import Worded
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import (
     DETERMINED_WIDTH,
     Determinacy,
@@ -25,7 +26,6 @@ from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time
-from psa_casadi.units import FloatArray
 
 #: Samples of a planned step, multisine, loop (per period) and hold.
 STEP_SAMPLES, MULTISINE_SAMPLES, LOOP_SAMPLES, HOLD_SAMPLES = 2000, 3000, 400, 2000

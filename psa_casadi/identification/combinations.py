@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from psa_casadi.display import Worded
+from psa_casadi.common.display import Worded
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.model.compose import Model
-from psa_casadi.variables import Values
+from psa_casadi.model.variables import Values
 
 #: A combination is known if its relative standard error is below this ...
 KNOWN = 0.1

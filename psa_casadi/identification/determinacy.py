@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.fitting.unknowns import (
@@ -14,11 +15,10 @@ from psa_casadi.identification.fitting.unknowns import (
     memory_starts,
 )
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import BoolArray, FloatArray
-from psa_casadi.variables import Interval
 
 #: A parameter with a standard error above this, in ordinary changes or ln units, is undetermined.
 DETERMINED_WIDTH = 0.5
@@ -26,7 +26,7 @@ DETERMINED_WIDTH = 0.5
 ASSUMED_RATIO_SPREAD = 0.7
 #: Smallest eigenvalue over the largest, negative, that is still rounding.
 _ROUNDING = 1e-9
-_NORMAL_95 = 1.959963984540054
+NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def determinacy(
     errors: FloatArray = np.sqrt(np.maximum(np.diag(of_values), 0.0))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
-        value, half = fit.model.values[name], _NORMAL_95 * float(errors[k])
+        value, half = fit.model.values[name], NORMAL_95 * float(errors[k])
         parameter = fit.model.parameter(name)
         log = parameter.log and value > 0.0
         if log:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
@@ -15,12 +16,11 @@ from psa_casadi.model.evidence import (
     ReferenceRun,
     SeenRange,
 )
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.noise import fast_noise, runs_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Interval
 
 #: The most samples of a reference run, and what straight lines between them may miss the voltage
 #: by, over its range.

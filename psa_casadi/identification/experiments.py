@@ -7,15 +7,15 @@ from typing import Any, cast
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems, quoted
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray, convert, parse_unit, si_unit
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 from psa_casadi.records.read.reading import signals_given
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold, Signals, in_parts, stairs
 from psa_casadi.records.split import Channel, Experiment, divided, whole, without_gaps
 from psa_casadi.records.suspects import suspects_of
-from psa_casadi.units import FloatArray, convert, parse_unit, si_unit
 
 #: Share of an output's range below which a difference of device and model does not count.
 STRAIGHT = 2e-5

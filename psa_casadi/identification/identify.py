@@ -5,7 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.display import made
+from psa_casadi.common.display import made
+from psa_casadi.common.interruption import current_work, interruptible_work
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.advice import Advice, advice
 from psa_casadi.identification.combinations import Combination, free_combinations
 from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
@@ -38,11 +41,8 @@ from psa_casadi.identification.start.ordinary import (
     forms_of,
 )
 from psa_casadi.identification.start.starting_points import LinearCandidate, linear_start
-from psa_casadi.interruption import current_work, interruptible_work
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Evidence
-from psa_casadi.notes import Note, note, texts
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.read.reading import Records, records_given

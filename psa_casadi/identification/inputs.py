@@ -21,17 +21,17 @@ import numpy as np
 import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import Further, trace_record
 from psa_casadi.identification.multistart import search_starts
 from psa_casadi.identification.refitting import refit, relevelled, weighted
-from psa_casadi.notes import Note, note
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 
 #: Nats by which inputs that are read another way must be likelier: a cause's price.
 LIKELIER = 8.0

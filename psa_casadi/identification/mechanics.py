@@ -24,7 +24,9 @@ from math import log
 import casadi as ca
 import numpy as np
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.progress import Progress
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.fitting.prediction import measured, predict
@@ -44,11 +46,9 @@ from psa_casadi.identification.refitting import (
 )
 from psa_casadi.identification.start.linear_response import oscillators
 from psa_casadi.identification.start.starting_points import Excerpt, fastest_part, placed, sought
-from psa_casadi.progress import Progress
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
-from psa_casadi.units import FloatArray
 
 Values = Mapping[str, float]
 

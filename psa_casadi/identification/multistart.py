@@ -7,7 +7,8 @@ from typing import TypeVar
 import casadi as ca
 import numpy as np
 
-from psa_casadi.errors import InputError, PsaError, quoted
+from psa_casadi.common.errors import InputError, PsaError, quoted
+from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import (
     refit,
@@ -19,10 +20,9 @@ from psa_casadi.identification.refitting import (
 )
 from psa_casadi.identification.result import StartOutcome
 from psa_casadi.model.compose import Model
-from psa_casadi.progress import Progress, silent
+from psa_casadi.model.variables import Parameter
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.variables import Parameter
 
 #: Evaluations of a start's first fit, and how many of the best go on to the end.
 _QUICK, _FOLLOWED = 15, 2

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.experiments import (
     column_notes,
@@ -23,8 +25,6 @@ from psa_casadi.identification.result import (
     with_origin,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise_kinds import notes_of
 from psa_casadi.records.signals import Hold
 

@@ -17,7 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.units import BoolArray, ComplexArray, FloatArray, IndexArray
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
@@ -26,12 +28,10 @@ from psa_casadi.identification.identify import StackIdentification, with_provena
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.start.ordinary import ordinary_values, starting_model
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note, texts
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
-from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: How far the voltage may stray from its two levels, and how long the rise may take of the hold.
 _LEVEL, _RISE = 0.05, 0.05

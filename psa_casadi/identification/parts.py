@@ -17,21 +17,21 @@ from itertools import pairwise
 
 import numpy as np
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.inputs import read_like, read_otherwise
 from psa_casadi.identification.multistart import levelled, search_starts
 from psa_casadi.identification.refitting import POLISH, weighted
 from psa_casadi.identification.result import EXCESSIVE, StartOutcome
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import first_order_noise
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.sizes import sized
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 
 #: A model follows an output where it misses less than this share of its standard deviation; one
 #: that forgets its start is not lost where it comes so near; beyond the last it shows nothing.

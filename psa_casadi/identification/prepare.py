@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note, note
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
+from psa_casadi.model.component import Component
+from psa_casadi.model.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 
 _EVALUATIONS = 40
 #: A step out is at most this many times the distance that has been covered.

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured

@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.display import Reported, frame, made
+from psa_casadi.common.display import Reported, frame, made
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.strict_json import json_text
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note, texts
+from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.records.noise import first_order_noise, runs_of
 from psa_casadi.records.noise_kinds import NoiseFound, noise_kinds
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.records.suspects import SPIKE
-from psa_casadi.strict_json import json_text
-from psa_casadi.units import BoolArray, FloatArray
-from psa_casadi.variables import Interval, Provenance
 from psa_casadi.version import __version__
 
 #: A residual above this multiple of its fast noise shows that the model lacks something.

@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.components.stack import MEMORY_SPECTRUM
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.mechanics import exchanged, retuned, with_fast, without_blur
 from psa_casadi.identification.multistart import fits_from
@@ -38,14 +40,12 @@ from psa_casadi.identification.start.starting_points import (
     resolved,
     starting_points,
 )
+from psa_casadi.model.components.stack import MEMORY_SPECTRUM
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = (

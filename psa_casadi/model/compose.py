@@ -6,13 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.component import Component, Expression
-from psa_casadi.display import Celled
-from psa_casadi.errors import InputError, quoted
+from psa_casadi.common.display import Celled
+from psa_casadi.common.errors import InputError, quoted
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Component, Expression
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.structure import Structure, structure_of
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Input, Parameter, Provenance, Publication, State, nominal_value
+from psa_casadi.model.variables import (
+    Input,
+    Parameter,
+    Provenance,
+    Publication,
+    State,
+    nominal_value,
+)
 
 __all__ = ["Model", "Structure", "compose"]
 

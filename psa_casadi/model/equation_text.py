@@ -20,10 +20,10 @@ from warnings import catch_warnings, simplefilter
 
 import casadi as ca
 
-from psa_casadi.component import Equations, Expression, KeptEquations, OnDemand
-from psa_casadi.errors import Problems
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.strict_json import brief
+from psa_casadi.model.component import Equations, Expression, KeptEquations, OnDemand
 from psa_casadi.model.graph import ExpressionGraph
-from psa_casadi.strict_json import brief
 
 _ONE = "sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp expm1 log log1p log10 sqrt"
 _ONE += " fabs sign floor ceil erf"

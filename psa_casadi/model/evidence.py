@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
-from psa_casadi.strict_json import brief
-from psa_casadi.variables import Interval
+from psa_casadi.common.strict_json import brief
+from psa_casadi.model.variables import Interval
 
 
 @dataclass(frozen=True)

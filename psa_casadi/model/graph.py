@@ -11,9 +11,9 @@ from typing import ClassVar
 
 import casadi as ca
 
-from psa_casadi.component import Expression
-from psa_casadi.errors import InputError
-from psa_casadi.symbolic import instructions
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.symbolic import instructions
+from psa_casadi.model.component import Expression
 
 
 @dataclass(frozen=True)

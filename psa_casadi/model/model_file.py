@@ -9,24 +9,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from psa_casadi.component import Component, FmuUsed
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.mechanics import MODAL_SERIES
-from psa_casadi.effects.patches import PATCHES
-from psa_casadi.errors import InputError, Problems, quoted
-from psa_casadi.files import atomic_write
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.evidence import Evidence, contradictions
-from psa_casadi.model.own_components import (
-    Opener,
-    OwnComponent,
-    components_of,
-    refuse_large,
-    written,
-)
-from psa_casadi.model.own_effects import declaration_hash, known_effects
-from psa_casadi.strict_json import (
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.files import atomic_write
+from psa_casadi.common.strict_json import (
     brief,
     decode,
     json_text,
@@ -36,7 +21,22 @@ from psa_casadi.strict_json import (
     plain,
     read_json,
 )
-from psa_casadi.variables import Interval, Parameter, Provenance, Publication
+from psa_casadi.model.component import Component, FmuUsed
+from psa_casadi.model.components import COMPONENTS
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.mechanics import MODAL_SERIES
+from psa_casadi.model.effects.patches import PATCHES
+from psa_casadi.model.evidence import Evidence, contradictions
+from psa_casadi.model.own_components import (
+    Opener,
+    OwnComponent,
+    components_of,
+    refuse_large,
+    written,
+)
+from psa_casadi.model.own_effects import declaration_hash, known_effects
+from psa_casadi.model.variables import Interval, Parameter, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
 #: What a diagnosis may add to the effects of the table.

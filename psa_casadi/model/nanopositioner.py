@@ -6,12 +6,12 @@ from itertools import product
 import numpy as np
 import scipy
 
-from psa_casadi.errors import InputError, Problems, quoted
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.model.parts import compensator_for, part_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.model.system import System
-from psa_casadi.units import ComplexArray, FloatArray
 
 #: A mode that is better damped needs no notch.
 _DAMPED = 0.5

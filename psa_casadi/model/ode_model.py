@@ -7,12 +7,12 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Balance, Component, Equations, Expression, OnDemand, Symbols
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.symbolic import instructions
+from psa_casadi.common.units import parse_unit
+from psa_casadi.model.component import Balance, Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.symbolic import instructions
-from psa_casadi.units import parse_unit
-from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
+from psa_casadi.model.variables import Input, Output, Parameter, State, nominal_value
 
 #: The columns of symbols and of expressions, in the order of the function's inputs and outputs.
 SYMBOLS, EXPRESSIONS = ("t", "x", "u", "p", "w", "z"), ("ode", "y", "zero", "wdef", "alg")

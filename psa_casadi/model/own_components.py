@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeVar
 
-from psa_casadi.component import Balance, Component, FmuUsed, KeptEquations, OnDemand
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.model.component import Balance, Component, FmuUsed, KeptEquations, OnDemand
 from psa_casadi.model.equation_text import EquationTexts, equations_of, texts_of
 from psa_casadi.model.ode_model import check_variable
 from psa_casadi.model.ports import Opened, Port, ported
 from psa_casadi.model.structure import check_declarations
-from psa_casadi.variables import Input, Output, Parameter, State, Values, nominal_value
+from psa_casadi.model.variables import Input, Output, Parameter, State, Values, nominal_value
 
 T = TypeVar("T")
 

@@ -22,12 +22,12 @@ from types import ModuleType
 
 import casadi as ca
 
-from psa_casadi.component import Component, OnDemand
-from psa_casadi.components import BASE, COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.mechanics import MODAL_SERIES
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.model.component import Component, OnDemand
+from psa_casadi.model.components import BASE, COMPONENTS
 from psa_casadi.model.compose import compose
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.mechanics import MODAL_SERIES
 
 #: Group of the entry points that announce modules with effects.
 GROUP = "psa_casadi.effects"

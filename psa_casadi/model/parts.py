@@ -3,10 +3,10 @@
 from dataclasses import dataclass, replace
 from math import inf, pi
 
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.model.components import COMPONENTS
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 
 __all__ = ["PARTS", "PartKind", "compensator_for", "part_model"]
 

@@ -19,11 +19,11 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Balance, Component, Equations, Expression, OnDemand, Symbols
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.common.units import rate_unit, si_unit
+from psa_casadi.model.component import Balance, Component, Equations, Expression, OnDemand, Symbols
 from psa_casadi.model.compose import Model
-from psa_casadi.symbolic import in_turn
-from psa_casadi.units import rate_unit, si_unit
-from psa_casadi.variables import Parameter
+from psa_casadi.model.variables import Parameter
 
 Kind = Literal["input", "rate", "output", "parameter", "intermediate"]
 _PREFIX: dict[Kind, str] = {

@@ -23,10 +23,10 @@ import difflib
 import re
 from dataclasses import dataclass
 
-from psa_casadi.components import BASE
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.variables import Provenance
+from psa_casadi.model.variables import Provenance
 
 PAPER = "Yang and Zhu 2015"
 

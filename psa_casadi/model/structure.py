@@ -7,7 +7,9 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import (
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.model.component import (
     BALANCES,
     Balance,
     Component,
@@ -16,9 +18,7 @@ from psa_casadi.component import (
     Foreign,
     Symbols,
 )
-from psa_casadi.errors import InputError, Problems, quoted
-from psa_casadi.symbolic import in_turn
-from psa_casadi.variables import Input, Output, Parameter, State
+from psa_casadi.model.variables import Input, Output, Parameter, State
 
 
 def refuse_duplicates(components: tuple[Component, ...], symbols: list[str]) -> None:

@@ -12,12 +12,12 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import parse_unit
+from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.ode_model import is_identifier
-from psa_casadi.units import parse_unit
-from psa_casadi.variables import Input, Nominal, Output, Values, nominal_value
+from psa_casadi.model.variables import Input, Nominal, Output, Values, nominal_value
 
 #: A port: the name of a part and of one of its inputs or outputs.
 Port = tuple[str, str]

@@ -7,9 +7,9 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.component import Expression
-from psa_casadi.errors import InputError
-from psa_casadi.units import FloatArray
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Expression
 
 
 def table(

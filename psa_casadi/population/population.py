@@ -19,9 +19,10 @@ from functools import cache
 import numpy as np
 import scipy
 
-from psa_casadi.components import COMPONENTS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.components import COMPONENTS
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.population.finding import NORMAL_95, Estimate, Finding
 from psa_casadi.population.statistics import (
     FEWEST,
@@ -36,7 +37,6 @@ from psa_casadi.population.statistics import (
     mixed_regression,
     outliers,
 )
-from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

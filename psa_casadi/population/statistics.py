@@ -52,8 +52,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from psa_casadi.errors import InputError
-from psa_casadi.units import BoolArray, FloatArray
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import BoolArray, FloatArray
 
 Adjustment = Literal["benjamini-hochberg", "bonferroni"]
 #: Adjusted p values below this are significant.

@@ -12,14 +12,14 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.interruption import current_work, raise_if_stopped
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import Unknowns
-from psa_casadi.interruption import current_work, raise_if_stopped
 from psa_casadi.posterior.task import Block, Task
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.split import DISPLACEMENT, Channel
-from psa_casadi.units import FloatArray
 from psa_casadi.version import __version__
 
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.display import Reported, frame
-from psa_casadi.errors import Problems
-from psa_casadi.files import atomic_write, temporary_folder
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.common.display import Reported, frame
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.files import atomic_write, temporary_folder
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.notes import Note, note, texts
+from psa_casadi.common.progress import Progress, on_a_terminal, silent
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note, texts
 from psa_casadi.posterior.chains import (
     Chains,
     chains_of,
@@ -23,7 +24,6 @@ from psa_casadi.posterior.chains import (
     sampler_and_arviz,
 )
 from psa_casadi.posterior.task import Task, own_task_of, task_of
-from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import DISPLACEMENT
 from psa_casadi.simulation.side_by_side import one_thread, one_thread_of_algebra

@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.notes import Note
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.fitting.fit import (
     Fit,
     Objective,
@@ -24,12 +26,10 @@ from psa_casadi.identification.refitting import noise_levels, weighted
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Channel, Experiment, whole, without_gaps
 from psa_casadi.simulation.simulate import Way
-from psa_casadi.units import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, eq=False)

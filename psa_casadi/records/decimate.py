@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records.noise import fast_noise
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
 
 #: As many samples are left at least.
 FEWEST = 2000

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray, IndexArray
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray, IndexArray
 
 _DOMINANT = 0.5
 _SIDE_LINES = 5

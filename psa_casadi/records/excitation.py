@@ -8,8 +8,8 @@ the voltage is meant to be linear.
 
 import numpy as np
 
-from psa_casadi.errors import InputError
-from psa_casadi.units import FloatArray
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 
 
 def time_grid(duration: float, sample_time: float) -> FloatArray:

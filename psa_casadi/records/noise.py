@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import scipy
 
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 
 _WHITE = -0.6
 

@@ -15,7 +15,8 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from psa_casadi.notes import Note, note
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.records.drive import dominant_line, is_mains, reversals
 from psa_casadi.records.noise import (
     forgets,
@@ -41,7 +42,6 @@ from psa_casadi.records.noise_models import (
     score,
     tones_in,
 )
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 Kind = Literal[
     "white", "autoregressive", "one_over_f", "coloured", "telegraph", "steps", "heavy_tails",

@@ -33,10 +33,10 @@ from typing import Literal
 import numpy as np
 import scipy
 
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import convolved, filtered, forgets, lag_products, lines_in, peaks
 from psa_casadi.records.repeats import autoregression_of
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: A spectrum's shape by the name of its family.
 Family = Literal["white", "autoregressive", "one_over_f"]

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.records.signals import Hold, Signals, frozen
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Fewer samples than this describe no experiment, and judge none.
 FEWEST_SAMPLES = 16

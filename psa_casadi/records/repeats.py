@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.records.noise import lag_products, runs_of
 from psa_casadi.records.record import Record
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Voltages are the same to within this share of their range, as the rms of this many neighbours.
 SAME, NEIGHBOURS = 1e-3, 9

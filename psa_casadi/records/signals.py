@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.display import Plotted, frame, with_units
-from psa_casadi.errors import Problems
-from psa_casadi.units import BoolArray, FloatArray
+from psa_casadi.common.display import Plotted, frame, with_units
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.units import BoolArray, FloatArray
 
 #: What an input does between two samples.
 Hold = Literal["linear", "zero"]

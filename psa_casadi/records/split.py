@@ -8,13 +8,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.notes import Note
+from psa_casadi.common.notes import Note
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.repeats import held
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.suspects import HIDDEN
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: Turns by less than this share of the span are no reversals here; sizes of rises and falls are
 #: distinguished at these shares of it, durations by this factor.

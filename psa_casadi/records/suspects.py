@@ -19,7 +19,8 @@ from typing import Any, Literal
 import numpy as np
 import scipy
 
-from psa_casadi.notes import Note, note
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.records.noise import (
     BLOCK,
     high_frequency_noise,
@@ -29,7 +30,6 @@ from psa_casadi.records.noise import (
     runs_of,
 )
 from psa_casadi.records.record import Record
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Neighbours on each side of which a sample is a function, and instants of the inputs around it.
 _REACH, _INPUTS = 4, 1

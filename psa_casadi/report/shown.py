@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
+from psa_casadi.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
@@ -16,7 +17,6 @@ from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Population
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import Signals
-from psa_casadi.report.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report

@@ -23,13 +23,13 @@ from pathlib import Path
 import casadi as ca
 import numpy.lib.introspect
 
-from psa_casadi.cache import VARIABLE, cached, writable_room
-from psa_casadi.children import run_child
-from psa_casadi.component import Expression
-from psa_casadi.errors import MachineError
-from psa_casadi.files import temporary_folder
+from psa_casadi.common.cache import VARIABLE, cached, writable_room
+from psa_casadi.common.children import run_child
+from psa_casadi.common.errors import MachineError
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Structure
-from psa_casadi.symbolic import in_turn
 
 #: Flags for speed that keep the results of one source the same on every compiler.
 OPTIMISE = ("-std=c99", "-O2", "-ffp-contract=off")

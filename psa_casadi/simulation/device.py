@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.compiler import sources_directory
 from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, model_text, time_steps
-from psa_casadi.units import FloatArray
 
 #: Options of its compiler: functions without a place are the device's; products and sums are
 #: rounded one by one, as on the CPU.

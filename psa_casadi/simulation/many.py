@@ -7,8 +7,10 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, quoted
+from psa_casadi.common.errors import InputError, quoted
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.device import Numbers, Summary, Task, device_module, run_on_device
 from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
@@ -16,8 +18,6 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Way, output_of, record_inputs, trace
 from psa_casadi.simulation.start import start_on, starts_on
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 ReductionName = Literal["range", "peak", "last", "misfit"]
 _Reduce = Callable[[FloatArray], npt.ArrayLike]

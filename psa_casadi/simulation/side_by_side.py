@@ -14,8 +14,8 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from psa_casadi.errors import MachineError, PsaError
-from psa_casadi.interruption import interruptible_work, set_within
+from psa_casadi.common.errors import MachineError, PsaError
+from psa_casadi.common.interruption import interruptible_work, set_within
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.run import why_not
 from psa_casadi.simulation.simulate import output_of

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.display import Lined, Plotted, frame, with_units
-from psa_casadi.errors import InputError, Problems, quoted
+from psa_casadi.common.display import Lined, Plotted, frame, with_units
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.exact.run import NotExact, run_exact
 from psa_casadi.simulation.start import start_on, start_state
 from psa_casadi.simulation.stepper import Steps, run
-from psa_casadi.units import FloatArray
 
 #: Outputs that are the displacement a model shows, the first that it has.
 SHOWN = ("measured_displacement", "displacement")

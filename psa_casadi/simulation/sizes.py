@@ -7,15 +7,15 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import Steps, run
-from psa_casadi.symbolic import in_turn
-from psa_casadi.units import FloatArray
 
 #: Steps between two samples, and mean ones of a record, beyond which a run is abandoned.
 _STEPS, _MEAN_STEPS = 3000, 200

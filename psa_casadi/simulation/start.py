@@ -12,11 +12,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Expression
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.common.units import BoolArray, ComplexArray, FloatArray
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.symbolic import in_turn
-from psa_casadi.units import BoolArray, ComplexArray, FloatArray
 
 _NEWTON_STEPS, _FILTER_STEPS = 30, 8
 #: Sets that one call of a function takes.

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.errors import InputError, Problems, PsaError
-from psa_casadi.interruption import flag_address
+from psa_casadi.common.errors import InputError, Problems, PsaError
+from psa_casadi.common.interruption import flag_address
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import fingerprint, generate_c, generated_library
 from psa_casadi.simulation.timings import count_run, count_steps
-from psa_casadi.units import FloatArray
 
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")

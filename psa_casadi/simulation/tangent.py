@@ -20,16 +20,16 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
+from psa_casadi.common.symbolic import in_turn, instructions
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure, structure_of
+from psa_casadi.model.variables import Input, Parameter
 from psa_casadi.simulation.exact.run import time_steps
 from psa_casadi.simulation.exact.split import closure, dependence, split_of
 from psa_casadi.simulation.simulate import Way, trace
 from psa_casadi.simulation.start import start_for
-from psa_casadi.symbolic import in_turn, instructions
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Input, Parameter
 
 _GAIN, _INPUT = "tangent_gain", "tangent_"
 

@@ -7,7 +7,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from threading import Lock, get_ident
 
-from psa_casadi.interruption import set_within
+from psa_casadi.common.interruption import set_within
 
 #: What is spent outside every stage.
 REST = "rest"

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 from tests.any_model.own_plants import multisine
 
 Table = dict[str, FloatArray]

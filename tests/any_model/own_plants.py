@@ -11,8 +11,8 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records.signals import Signals
-from psa_casadi.units import FloatArray
 
 Rates = Callable[[float, Any], list[float]]
 

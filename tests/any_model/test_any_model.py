@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 import psa_casadi as psa
 from build_scripts import effects_page
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
@@ -25,7 +26,6 @@ from psa_casadi.records.signals import Signals
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of
-from psa_casadi.units import FloatArray
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
 from tests.report.browser import DARK, find_browser

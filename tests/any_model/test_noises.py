@@ -7,8 +7,8 @@ from numpy.random import Generator
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from psa_casadi.notes import Note
-from psa_casadi.units import FloatArray
+from psa_casadi.common.notes import Note
+from psa_casadi.common.units import FloatArray
 
 TIME = np.linspace(0.0, 60.0, 1500)
 STIFFNESS, DAMPING = 10.0, 0.8

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.held_out import Share, removed_from
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Channel, Experiment
-from psa_casadi.units import FloatArray
 
 #: Noise of two outputs, each in its unit, and what each of two causes adds to them.
 NOISE = np.array([2e-6, 0.3])

@@ -15,10 +15,10 @@ import pytest
 from scipy.io import savemat
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.experiments import column_notes, experiments_of, given_to
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import cylinder, motor, oscillator
 

@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.common.notes import Note
 from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.identification.multistart import search_starts
-from psa_casadi.notes import Note
 from psa_casadi.simulation.stepper import SimulationError
 from tests.any_model import hard_plants as hard
 

@@ -24,12 +24,12 @@ from psa_casadi.cli.check import check_cases
 from psa_casadi.cli.failures import junit_text
 from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, Course, ProgressLine, show_table, working
 from psa_casadi.datasets import DATASETS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.examples.index import examples
 from psa_casadi.export.check.check import CheckReport, CheckRow
 from psa_casadi.export.importer.fmu_model import load_model
 from psa_casadi.identification import identify
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.model_file import save_model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import read_record

@@ -10,11 +10,11 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from psa_casadi import cache
 from psa_casadi.cli.failures import guarded
-from psa_casadi.components import BASE
-from psa_casadi.errors import InputError, MachineError
-from psa_casadi.files import PREFIX, atomic_path, atomic_write
+from psa_casadi.common import cache
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.files import PREFIX, atomic_path, atomic_write
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation import compiler
@@ -136,7 +136,7 @@ def test_what_the_machine_refuses_is_no_fault_of_the_package(case: str) -> None:
 FAULTS = (KeyError("x"), ValueError("x"), FileNotFoundError(errno.ENOENT, "x"))
 
 
-@pytest.mark.parametrize("error", [*FAULTS, ImportError("x", name="psa_casadi.files")])
+@pytest.mark.parametrize("error", [*FAULTS, ImportError("x", name="psa_casadi.common.files")])
 def test_a_fault_of_the_package_is_called_one(
     error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:

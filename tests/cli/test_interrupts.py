@@ -15,16 +15,16 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.export.importer import masters
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify
-from psa_casadi.interruption import interruptible_work
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import command
 from tests.report.report_cases import diagnosis
 from tests.studies.plants.make import make_record

@@ -10,7 +10,7 @@ from build_scripts import copied_pages
 from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import blocks_of, find_blocks, pages, run_blocks
 from psa_casadi.cli.app import app
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 
 TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 

@@ -18,7 +18,7 @@ import numpy as np
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.cli import main
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 Floats = FloatArray
 DATA = Path(psa.__file__).parent / "data"

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from build_scripts.measured_data import measured_data_directory
+from psa_casadi.common.units import FloatArray
 from psa_casadi.datasets import DATASETS
 from psa_casadi.datasets.devices import OneAxis, linear_response
-from psa_casadi.units import FloatArray
 
 #: Folder of the originals of the steering mirror, which may not exist.
 ORIGINALS = measured_data_directory() / "steering_mirror_test"

@@ -9,10 +9,10 @@ from scipy.optimize import least_squares, linprog
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking.minimum_time import INTERVALS, QuickMove
 from psa_casadi.design.tracking.targets import AmplifierLimits, Target
 from psa_casadi.simulation.start import linear_part
-from psa_casadi.units import FloatArray
 
 _RATIOS = (1.0, 10.0, 100.0)
 

@@ -12,6 +12,7 @@ import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.cli import diagnose as command
 from psa_casadi.cli import diagnosis_files as files
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment import experiment
 from psa_casadi.design.experiment.criteria import (
     Criterion,
@@ -38,7 +39,6 @@ from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, draw, rest_
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.report.words.design_words import sentences
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import done, refused
 from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
+from psa_casadi.common.units import FloatArray
 from psa_casadi.simulation.start import linear_part
-from psa_casadi.units import FloatArray
 
 #: A mass on a spring that hardens: v' = (F - c v - k x - e x^3) / m.
 M, C, K, E = 0.5, 0.4, 200.0, 3e4

@@ -10,10 +10,10 @@ from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.examples.linearisation_trial import DriftingStack, Drive, ageing, driven, off_values
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.units import FloatArray
 from tests.export.modelica_runs import simulated
 from tests.tiers import slow, slow_but
 

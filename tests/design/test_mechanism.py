@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.mechanism.loop import (
     Mounting,
     bandwidth,
@@ -23,10 +25,8 @@ from psa_casadi.design.mechanism.mechanism import (
     mounted_model,
     root_locus,
 )
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
-from psa_casadi.units import FloatArray
 
 STACK = "PTBS200"
 #: A mechanism of 60 g, 900 N.s/m, 8 N/um: enough to move every pole of the stack.

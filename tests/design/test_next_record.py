@@ -10,11 +10,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design import Limits, design_experiment
 from psa_casadi.design.experiment.experiment import Informative, Separated
 from psa_casadi.design.experiment.search import Effort
 from psa_casadi.report.words.design_words import design_tables
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import done, refused, table
 from tests.tiers import slow
 

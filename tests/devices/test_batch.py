@@ -17,15 +17,15 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi import children
+from psa_casadi.common import children
+from psa_casadi.common.interruption import raise_if_stopped
+from psa_casadi.common.processes import Processes
+from psa_casadi.common.strict_json import json_text
 from psa_casadi.devices import executors
 from psa_casadi.devices.executors import outcomes
 from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
-from psa_casadi.interruption import raise_if_stopped
-from psa_casadi.processes import Processes
-from psa_casadi.report.documents.files import identification_file
+from psa_casadi.documents.files import identification_file
 from psa_casadi.simulation.side_by_side import threads
-from psa_casadi.strict_json import json_text
 from tests.contract.helpers import command
 from tests.report.report_cases import identification
 from tests.tiers import slow

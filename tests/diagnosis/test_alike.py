@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from psa_casadi.cli import diagnosis_files as files
-from psa_casadi.components import BASE
+from psa_casadi.common.errors import InputError
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.search.steps import one_of_each
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split

@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 
 import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
 NOISE = 5e-9

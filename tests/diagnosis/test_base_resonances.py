@@ -7,11 +7,11 @@ import pytest
 
 from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.simulate import simulate_record

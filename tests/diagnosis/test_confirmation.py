@@ -10,8 +10,8 @@ from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import Gain
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.doubts import doubtful_quantity
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.records.suspects import suspects

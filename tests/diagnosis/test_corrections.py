@@ -5,18 +5,18 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
 from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 
 TIME: FloatArray = np.linspace(0.0, 4.0, 2001)

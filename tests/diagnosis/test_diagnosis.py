@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.held_out import gain_of, lost_elsewhere
 from psa_casadi.records.drive import is_tone_separable
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import FloatArray
 from tests.studies.plants.make import make_record
 
 N = 4000

@@ -10,11 +10,12 @@ from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.cli.diagnosis_files import write_patch
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import filtered
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.export.importer.fmu_model import load_model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import write_record
 from psa_casadi.records.record import Record
@@ -22,7 +23,6 @@ from psa_casadi.records.split import split
 from psa_casadi.report.words.text import story
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import done
 from tests.report.report_cases import diagnosis
 from tests.tiers import slow, slow_but

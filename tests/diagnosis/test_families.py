@@ -9,7 +9,7 @@ import psa_casadi as psa
 from psa_casadi.diagnosis.corrections import KINDS, Patch
 from psa_casadi.diagnosis.families import CauseEvidence, families, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.report.words.verdict_words import family_sentence
 from tests.studies.plants.make import make_record
 from tests.tiers import slow

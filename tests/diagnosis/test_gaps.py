@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import gaps, without_gaps
-from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import loops
 from tests.studies.plants.stack import draw_stack

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.components import BASE
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.confirmation import held_out_excess
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, split
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow, slow_but
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.fitting.prediction import measured
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from tests.studies.plants.make import make_record, play_again

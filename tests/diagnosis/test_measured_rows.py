@@ -13,7 +13,7 @@ import pytest
 
 from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parents[2] / "docs" / "evidence.md"

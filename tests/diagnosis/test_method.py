@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.diagnosis.task import LIMITS, STEPS, Method, Thresholds
-from psa_casadi.notes import Note
 from tests.studies.benchmarks.ablation import (
     ablation_table,
     moved_constants,

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.errors import InputError
 from psa_casadi.records import Record, excitation
-from psa_casadi.units import FloatArray
 from tests.voltages import steps
 
 NOISE = 1e-8

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.result import Cause
 from psa_casadi.diagnosis.verdict import next_experiment, useful_records
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
 
 
 def _record(knots: list[tuple[float, float]]) -> Record:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 from tests.studies.plants.make import make_record
 from tests.tiers import slow_but
 

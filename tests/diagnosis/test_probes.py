@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.probes import residual_jumps
 from psa_casadi.identification.fitting.fit import fit
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 
 
 def _loops() -> tuple[FloatArray, FloatArray]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.reference import Healthy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.notes import Note
 from psa_casadi.records.split import whole
 from tests.any_model.own_models import oven
 from tests.studies.exam.play import play

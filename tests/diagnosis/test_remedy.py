@@ -6,20 +6,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component
-from psa_casadi.components import BASE
 from psa_casadi.diagnosis.remedy import Size, example, sizes
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.mechanics import MODAL_SERIES
+from psa_casadi.model.component import Component
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
+from psa_casadi.model.variables import Interval
 from psa_casadi.records import Record
 from psa_casadi.report.page.results import write_report
 from psa_casadi.report.words.phrases import handy_scale
 from psa_casadi.report.words.remedy_words import DO, RECORDS, size_text, what_now
 from psa_casadi.report.words.text import effect_page
-from psa_casadi.variables import Interval
 from tests.report.html_page import Page
 from tests.report.report_cases import ADDED, VERDICTS, diagnosis
 

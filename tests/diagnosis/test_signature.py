@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from psa_casadi.diagnosis.signature import signature
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.effects import EFFECTS
 from tests.contract.helpers import refused
 
 #: Coordinates along which an effect shows by its physics.

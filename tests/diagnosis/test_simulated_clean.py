@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.noise import detection_limit, known_colour, noise_floor
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.records import multisine, sine, triangle
 from psa_casadi.records.noise import last_place_of
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
 from tests.tiers import slow
 from tests.voltages import steps

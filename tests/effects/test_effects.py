@@ -13,31 +13,31 @@ import pytest
 from numpy.polynomial import Legendre
 
 import psa_casadi as psa
-from psa_casadi.component import Component
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
-from psa_casadi.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
-from psa_casadi.effects.environment import MAINS_HUM, TEMPERATURE
-from psa_casadi.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
-from psa_casadi.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
-from psa_casadi.effects.sensor import SENSOR_JUMP, SENSOR_NONLINEARITY, SENSOR_RIPPLE
-from psa_casadi.effects.strain import (
+from psa_casadi.common.units import FloatArray
+from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.ordinary import forms_of
+from psa_casadi.model.component import Component
+from psa_casadi.model.components import BASE, COMPONENTS, SIMPLIFIED
+from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
+from psa_casadi.model.effects.environment import MAINS_HUM, TEMPERATURE
+from psa_casadi.model.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
+from psa_casadi.model.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
+from psa_casadi.model.effects.sensor import SENSOR_JUMP, SENSOR_NONLINEARITY, SENSOR_RIPPLE
+from psa_casadi.model.effects.strain import (
     AGEING,
     FIELD_DEPENDENT_GAIN,
     SATURATION_OF_STRAIN,
     SELF_HEATING,
 )
-from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.identification.fitting.unknowns import static_compliance
-from psa_casadi.identification.start.ordinary import forms_of
-from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.scales import stiffness_scale, stroke_scale
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.scales import stiffness_scale, stroke_scale
 from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import Steps, run
-from psa_casadi.units import FloatArray
 from tests.export.modelica_runs import right_side_error
 from tests.model.random_models import random_model, random_point
 from tests.model.stack_models import LINEAR, stack

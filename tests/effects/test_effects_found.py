@@ -10,17 +10,17 @@ from scipy.signal import lfilter, lsim
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects.mechanics import MODAL_SERIES
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.linear_response import Response, modes_of
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
+from psa_casadi.model.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import parameter_table
-from psa_casadi.units import FloatArray
 from tests.studies.exam.hysteresis import relay_means
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.mechanics import structural_mode

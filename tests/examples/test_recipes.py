@@ -20,9 +20,9 @@ from fmpy import read_model_description
 
 import psa_casadi as psa
 from build_scripts.measured_data import ROOT
-from psa_casadi.component import BALANCES
 from psa_casadi.examples.index import Example, Script, examples
 from psa_casadi.export.fmu.platforms import chosen_platforms
+from psa_casadi.model.component import BALANCES
 from tests.contract.helpers import done
 from tests.export.modelica_runs import STUB, load
 from tests.tiers import slow

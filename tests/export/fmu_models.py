@@ -9,11 +9,11 @@ from pathlib import Path
 
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
 from psa_casadi.export.fmu.archive import export_fmu, write_archive
 from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.model.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS
 from tests.model.sampled_models import controller, loop
 

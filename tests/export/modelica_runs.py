@@ -9,8 +9,8 @@ import numpy as np
 import rumoca
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.units import FloatArray
 
 _SAMPLES = 200
 #: The connectors and parts of Modelica's library that the wired example names, as stubs.

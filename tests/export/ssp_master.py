@@ -20,12 +20,12 @@ from typing import Any, Self
 import numpy as np
 from fmpy.ssp.ssd import read_ssd
 
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.archive import unpack
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp import OUTSIDE, Port, Wire
-from psa_casadi.files import temporary_folder
-from psa_casadi.units import FloatArray
 
 #: Multiple of a port's nominal size beyond which a co-simulation counts as blown up.
 _BEYOND = 1e3

@@ -11,7 +11,7 @@ from pythonfmu3.builder import FmuBuilder as Builder3
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 _FOLDER = tempfile.TemporaryDirectory()
 _SUPPLIERS = Path(__file__).with_name("suppliers")

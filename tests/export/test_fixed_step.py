@@ -17,6 +17,8 @@ from fmpy.validation import validate_fmu
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import step_seconds
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.units import FloatArray
 from psa_casadi.examples.linearisation_trial import DriftingStack
 from psa_casadi.export.fixed_step.code import PRECISIONS
 from psa_casadi.export.fixed_step.export import (
@@ -33,7 +35,6 @@ from psa_casadi.export.fmu.sources import FIXED_ENTRY
 from psa_casadi.export.fmu.sources import STRICT as AS_EXPORTED
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.files import temporary_folder
 from psa_casadi.report.words.text import check_sentence
 from psa_casadi.simulation.compiler import (
     compiler_command,
@@ -42,7 +43,6 @@ from psa_casadi.simulation.compiler import (
     shared_library,
     zig_command,
 )
-from psa_casadi.units import FloatArray
 from tests.export.c_host.build import HEADERS, HERE
 from tests.export.fmu_models import files_inside, rewritten
 from tests.model.stack_models import stack

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.fixed_step.export import FixedStep, Probe, fixed_step, played_inputs
 from psa_casadi.simulation.compiler import run_compiler, zig_command
-from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
 from tests.model.stack_models import stack
 from tests.tiers import slow

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.check.agreement import has_reference
@@ -22,7 +23,6 @@ from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.reference import simulate
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.units import FloatArray
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import simulated
 from tests.export.ssp_master import load_ecos

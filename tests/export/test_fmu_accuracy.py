@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.importer.fmu import CO_SIMULATION, ERROR, MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate, communicate
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.reference import simulate
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 from tests.export.fmu_models import exported, model_named
 from tests.model.sampled_models import PERIOD, loop
 from tests.studies.benchmarks.fmu import STEP_SHARE, TIGHTEST_STEP

@@ -21,6 +21,7 @@ import pytest
 from lxml import etree  # type: ignore[import-untyped]
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.check import CheckRow
 from psa_casadi.export.check.description import missing_notices, published_as, unreproducible_parts
@@ -45,10 +46,9 @@ from psa_casadi.export.fmu.terminals import terminals_and_icons, terminals_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.model.model_file import save_model
+from psa_casadi.model.variables import Publication
 from psa_casadi.simulation.compiler import c_code, generate_c, run_compiler
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Publication
 from tests.contract.helpers import done, refused
 from tests.export.fmu_models import assert_valid, entries, exported, model_named, rewritten
 from tests.tiers import slow_but

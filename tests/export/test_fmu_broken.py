@@ -14,6 +14,7 @@ import pytest
 from fmpy.validation import _validate_variable_names
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check import agreement, binaries, check, description
 from psa_casadi.export.check.agreement import expected_outputs
 from psa_casadi.export.check.binaries import FUNCTIONS, read_binary
@@ -23,7 +24,6 @@ from psa_casadi.export.fmu.archive import MODEL_ENTRY, write_archive
 from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.report.words.text import check_sentence
-from psa_casadi.units import FloatArray
 from tests.export.c_host.build import binary
 from tests.export.fmu_models import entries, exported, model_named, recompiled, rewritten
 from tests.tiers import slow, slow_but

@@ -16,6 +16,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.importer.fmu import (
     DISCARD,
@@ -25,8 +26,7 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
+from psa_casadi.model.variables import nominal_value
 from tests.export.fmi3_instances import Instance3, Update, loaded
 from tests.export.fmu_models import exported, model_named
 from tests.tiers import slow_but

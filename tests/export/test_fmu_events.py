@@ -12,6 +12,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fmu.reference_run import SHARE, STEPS_PER_PERIOD, reference_inputs
 from psa_casadi.export.importer.fmu import (
@@ -23,7 +24,6 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.units import FloatArray
 from tests.export.fmi3_instances import Instance3, loaded
 from tests.export.fmu_models import entries, exported, model_named
 from tests.tiers import slow, slow_but

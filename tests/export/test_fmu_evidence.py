@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components.outputs import OUTPUT
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
@@ -27,10 +26,11 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.model.components.outputs import OUTPUT
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.split import whole
-from psa_casadi.variables import Interval
 from tests.contract.helpers import done
 from tests.export.fmu_models import assert_valid, exported, files_inside, rewritten
 from tests.model.evidence_models import evident_fmu, evident_model, noisy_record

@@ -21,14 +21,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from psa_casadi.children import heard
-from psa_casadi.errors import InputError
+from psa_casadi.common.children import heard
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import temporary_folder
 from psa_casadi.export.check import apart
 from psa_casadi.export.check.binaries import FUNCTIONS
 from psa_casadi.export.check.check import CheckRow, check_fmu
 from psa_casadi.export.importer import archive as limits
 from psa_casadi.export.importer.archive import Archive, archive_problems
-from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 from tests.contract.helpers import command
 from tests.export.ssp_master import SspArchive

@@ -16,11 +16,11 @@ from fmpy.fmi2 import FMU2Model
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
-from psa_casadi.units import FloatArray
 
 _FOLDER = tempfile.TemporaryDirectory()
 _SOURCES = Path(__file__).parent / "pendulum"

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 from build_scripts.compile_everywhere import complaint
-from psa_casadi.cache import cache_directory
+from psa_casadi.common.cache import cache_directory
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import exported_texts
 from psa_casadi.simulation.compiler import OPTIMISE, zig_command
-from psa_casadi.units import FloatArray
 from tests.export.c_host.build import (
     EMULATED,
     HEADERS,

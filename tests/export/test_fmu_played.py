@@ -13,8 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.children import end_children
 from psa_casadi.cli.app import app
+from psa_casadi.common.children import end_children
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.importer.fmu import Fmu
@@ -25,7 +26,6 @@ from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 from tests.export.ssp_master import SspArchive, couple
 from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
 from tests.export.test_fmu_model import pendulum

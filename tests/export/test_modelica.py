@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.modelica.expression import Graph, Printer
 from psa_casadi.export.modelica.package import modelica_text, reciprocal
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import done
 from tests.export.modelica_runs import (
     STUB,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import rumoca
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
@@ -21,10 +21,10 @@ from psa_casadi.export.importer.fmu import (
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.variables import Input, Output, Parameter, State
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Input, Output, Parameter, State
 from tests.export.fmu_models import exported
 from tests.export.modelica_runs import load
 from tests.model.sampled_models import (

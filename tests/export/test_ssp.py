@@ -10,7 +10,7 @@ import pytest
 from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp import (

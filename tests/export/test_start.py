@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import truth_of
 from psa_casadi.export.check.description import wrong_start_values
 from psa_casadi.export.check.structure import wrong_start
@@ -18,10 +20,8 @@ from psa_casadi.export.fmu.documentation import documentation
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
 from psa_casadi.export.importer.masters import Signals, co_simulate
-from psa_casadi.files import temporary_folder
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.simulation.start import initial_slope, start_state
-from psa_casadi.units import FloatArray
 from tests.contract.helpers import done, refused
 from tests.export.fmu_models import exported, model_named
 from tests.model.stack_models import jacobian, sine, stack

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.web import web_module
 from psa_casadi.report.page.live import live_data
 from psa_casadi.simulation.simulate import accurate, input_samples
 from psa_casadi.simulation.start import start_on
-from psa_casadi.units import FloatArray
 from tests.model.sampled_models import controller
 from tests.report.browser import Browser, find_browser
 from tests.report.live_pages import case, run_in_browser

@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
 from psa_casadi.identification.identify import StackIdentification, identify
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, read_record
 from psa_casadi.records.split import whole
-from psa_casadi.units import FloatArray
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.stack import Stack, loop_width
 

@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import Determinacy, determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 from tests.studies.benchmarks.records import LOOP_FREQUENCIES, loop_voltage
 

@@ -7,10 +7,10 @@ from functools import lru_cache
 import numpy as np
 
 from psa_casadi import reference
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.identification.start.linear_response import mechanics_poles, numerator_time
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, sine, time_grid
-from psa_casadi.units import ComplexArray, FloatArray
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
 #: A loop that leads, for which the paper's condition gamma > beta holds (over k_L).

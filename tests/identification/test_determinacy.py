@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.combinations import Combination, free_combinations, physical_formulas
 from psa_casadi.identification.determinacy import Determinacy, covariance_of
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.identification.loop_fits import FREE, LOOP, loops
 from tests.model.stack_models import stack
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.start.doubts import (
     doubtful_quantity,
@@ -21,9 +21,9 @@ from psa_casadi.identification.start.doubts import (
     refuse_wrapped,
 )
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.record import Record
 from psa_casadi.records.suspects import suspects
-from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.excitations import loops
 from tests.studies.plants.stack import draw_stack

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.simulate import EXACT, STEPPER, Way, simulate
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
 from tests.identification.test_fit import model_with
 from tests.simulation.exact_cases import OUTPUT, composite, inputs, times, with_effect
 

@@ -6,21 +6,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit, Objective, fit
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.refitting import same_place
 from psa_casadi.identification.search import fit_base, free_parameters
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, divided, whole
 from psa_casadi.simulation.simulate import Way, simulate
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 from tests.tiers import slow
 
 SIGMA = 2e-8

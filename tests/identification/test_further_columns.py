@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.components.surroundings import FLEXURE
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import texts
 from psa_casadi.diagnosis.diagnose import decided
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Objective, fit
 from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
+from psa_casadi.model.components.surroundings import FLEXURE
 from psa_casadi.model.compose import compose
-from psa_casadi.notes import texts
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole

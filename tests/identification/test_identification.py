@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from psa_casadi import reference
-from psa_casadi.components import BASE
 from psa_casadi.identification import refitting
 from psa_casadi.identification.identify import identify
 from psa_casadi.identification.refitting import refit_or_keep
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, multisine, time_grid

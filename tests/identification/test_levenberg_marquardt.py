@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.levenberg_marquardt import Minimum, minimise
-from psa_casadi.units import FloatArray
 
 Pair = tuple[FloatArray, FloatArray]
 

@@ -7,19 +7,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.identification.start.starting_points import (
     LinearCandidate,
     excerpts,
     linear_start,
 )
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 from tests.identification.paper_cases import transfer
 from tests.studies.benchmarks.records import loop_voltage, multisine_voltage, step_voltage
 from tests.tiers import slow, slow_but

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.plots.findings import profile_plot
 from psa_casadi.report.words.advice_words import profile_sentences
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 
 SIGMA = 2e-8
 #: The lags of wafers and bonding layers are far below the sampling: a tenth and less of it.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.inputs import even_clock, smooth_between
@@ -13,7 +14,6 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.units import FloatArray
 
 FINER, STEP, COUNT = 20, 2e-4, 4000
 NOISE = 4e-9

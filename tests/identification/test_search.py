@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.identification.mechanics import exchanges
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.coverage import one_run
 from tests.studies.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from psa_casadi import two_clocks
+from psa_casadi.common.notes import texts
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.prepare import prepared
-from psa_casadi.notes import texts
 from psa_casadi.records import Record, read_record
-from psa_casadi.units import FloatArray
 from tests.studies.plants.base import Run, simulate_base
 from tests.studies.plants.sensor import held
 from tests.studies.plants.stack import draw_stack

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.integrate import odeint
 
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 Values = Mapping[str, float]
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import expm
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 PERIOD, LAG, GAIN, PROPORTIONAL, INTEGRAL = 1e-3, 4e-3, 2.0, 0.6, 150.0
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 #: The paper's stacks: the others are identified and have no published stroke.
 PAPER_STACKS = ("P-885.51", "PTBS200", "WYDS0808020")

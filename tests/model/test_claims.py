@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.component import READ_OFF, RECORD_DURATION
+from psa_casadi.common.units import FloatArray, convert
+from psa_casadi.model.component import READ_OFF, RECORD_DURATION
 from psa_casadi.model.compose import Structure
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.simulation.compiler import functions_of, generate_c, shared_library
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.units import FloatArray, convert
-from psa_casadi.variables import nominal_value
 from tests.model.random_models import Point, random_model, random_point
 from tests.tiers import slow, slow_but
 

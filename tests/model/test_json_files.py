@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.strict_json import MOST_BYTES, json_text, parse_json, read_json
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.strict_json import MOST_BYTES, json_text, parse_json, read_json
-from psa_casadi.variables import Interval, Provenance
+from psa_casadi.model.variables import Interval, Provenance
 from tests.model.evidence_models import evident_model
 from tests.mutations import sentences
 from tests.studies.fuzz.damage import damaged_bytes

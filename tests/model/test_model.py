@@ -10,8 +10,8 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.split import divided
-from psa_casadi.variables import Interval
 from tests.model.evidence_models import NOISE, OFFSET, evident_model, noisy_record
 
 CREEP, DRIFT = psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]

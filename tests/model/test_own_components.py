@@ -1,8 +1,8 @@
 """MODEL.json of components that no table has: declarations, ports, and what hostile files try."""
 
 import json
-import time
 from collections.abc import Callable
+from cProfile import Profile
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,8 @@ from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.model.ports import ports_of, with_ports
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.variables import nominal_value
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
 from tests.export.fmu_models import model_named
 from tests.model.sampled_models import loop
@@ -220,8 +220,7 @@ def test_a_mistake_in_an_own_component_is_named(case: str) -> None:
     change, problem = HOSTILE[case]
     content = json.loads(dumps(motor()))
     change(content)
-    began = time.process_time()
-    with pytest.raises(psa.InputError, match=r"m\.json") as caught:
+    with Profile() as calls, pytest.raises(psa.InputError, match=r"m\.json") as caught:
         loads(json.dumps(content), "m.json")
     assert problem in str(caught.value)
-    assert time.process_time() - began < 2.0
+    assert sum(c.callcount for c in calls.getstats()) < 3_000_000  # half of it: the units

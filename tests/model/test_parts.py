@@ -12,10 +12,10 @@ from scipy.interpolate import CubicSpline
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.nanopositioner import positioner_plant
-from psa_casadi.units import BoolArray, FloatArray
-from psa_casadi.variables import nominal_value
+from psa_casadi.model.variables import nominal_value
 from tests.export.modelica_runs import simulated
 from tests.model.plain_positioner import Controller, simulate_positioner
 from tests.tiers import slow

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.reference import Mechanics, Trajectory, from_samples, simulate
-from psa_casadi.units import FloatArray
 from tests.model.stack_models import PAPER_STACKS
 from tests.tiers import slow_but
 

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.strict_json import json_text
+from psa_casadi.documents.files import identification_file
+from psa_casadi.documents.findings import read_findings
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.model_file import dumps
 from psa_casadi.population.finding import Estimate, Finding, replayed
 from psa_casadi.population.population import population
-from psa_casadi.report.documents.files import identification_file
-from psa_casadi.report.documents.findings import read_findings
 from psa_casadi.report.page.devices import MOST, write_comparison, write_population
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.report.words.population_words import missed_sentences, population_sentences
-from psa_casadi.strict_json import json_text
 from tests.model.evidence_models import evident_model
 from tests.report.browser import DARK, PHONE, Browser, find_browser, seen_on_a_phone
 from tests.report.html_page import Page, figures

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.report.documents.files import identification_file
-from psa_casadi.report.documents.findings import finding_content
-from psa_casadi.strict_json import json_text
+from psa_casadi.common.strict_json import json_text
+from psa_casadi.documents.files import identification_file
+from psa_casadi.documents.findings import finding_content
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
 from tests.contract.helpers import done

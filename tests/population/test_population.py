@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.population.finding import Estimate, Finding
 from psa_casadi.population.population import differences, frequencies, population
 from psa_casadi.population.statistics import adjusted, batch_test, drift, mixed_regression, outliers
-from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 
 # Thirteen trials of a vaccine: events and others, treated and control, and the latitude (G. A.

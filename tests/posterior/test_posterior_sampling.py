@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from build_scripts.schemas import schema_texts
 from psa_casadi.cli.app import app
-from psa_casadi.interruption import interruptible_work, raise_if_stopped
+from psa_casadi.common.interruption import interruptible_work, raise_if_stopped
+from psa_casadi.common.units import FloatArray
 from psa_casadi.posterior import chains
 from psa_casadi.posterior.chains import chains_of
 from psa_casadi.posterior.task import Block, Density, Task, Within, task_of
-from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 
 FREE = ("k_L", "A", "n", "tau")

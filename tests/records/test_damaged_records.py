@@ -13,7 +13,7 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import apart
 from psa_casadi.records.read import table as tables

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification import prepare
 from psa_casadi.identification.identify import identify
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records import Record, sine, split, time_grid
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.split import LEAST, MOST, PARTS, excerpts
-from psa_casadi.units import FloatArray
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.stack import draw_stack
 from tests.tiers import slow

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import decaying_triangle, multisine, sine, time_grid, triangle
 
 TIME = time_grid(2.0, 1e-3)

@@ -15,7 +15,7 @@ import pyuff
 from numpy.typing import NDArray
 from openpyxl import Workbook
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns

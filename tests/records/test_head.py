@@ -8,7 +8,7 @@ import pyarrow
 import pytest
 from pyarrow import parquet
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records.read.apart import head_of
 from psa_casadi.records.read.columns import Field
 from tests.records.laboratory_bytes import Cell, xlsx

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import read_record, record_from
 from psa_casadi.records.read.columns import parse_columns
 from tests.records import record_files

@@ -9,9 +9,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records.noise_kinds import NoiseFound, NoiseKind, noise_kinds, notes_of
 from psa_casadi.report.words.notes import note_text
-from psa_casadi.units import FloatArray
 
 Rng = np.random.Generator
 

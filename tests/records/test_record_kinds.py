@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from tests.records.laboratory_bytes import Cell, hdf5, mat, npz, parquet, tdms, xlsx
 from tests.records.reading_here import here

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import table
 from tests.records.record_files import HEADER, ROWS, problems_of, write

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records import Record, read_record, write_record
-from psa_casadi.units import FloatArray
 from tests.records.record_files import HEADER, ROWS, write
 from tests.tiers import slow
 

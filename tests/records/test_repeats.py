@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation
 from psa_casadi.records.repeats import MeasuredNoise, held, holds, repeats, repetitions
-from psa_casadi.units import FloatArray
 
 LEVEL = 1e-8
 STEP = 1e-3

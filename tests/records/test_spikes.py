@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.records.suspects import spikes_in
-from psa_casadi.units import BoolArray, FloatArray
 
 N, DT = 3000, 1e-3
 T = DT * np.arange(N, dtype=np.float64)

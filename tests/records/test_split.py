@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from psa_casadi.common.notes import texts
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis.confirmation import coverage_notes
-from psa_casadi.notes import texts
 from psa_casadi.records import Record
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import divided, split, whole
-from psa_casadi.units import BoolArray, FloatArray
 
 
 def record(voltage: FloatArray) -> Record:

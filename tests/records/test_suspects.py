@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.notes import texts
+from psa_casadi.common.notes import texts
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records import Record, multisine, sine, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
 from psa_casadi.records.suspects import cleaned, suspects
-from psa_casadi.units import FloatArray
 from tests.tiers import slow_but
 from tests.voltages import steps
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.web import web_module
 from psa_casadi.model.compose import Model
 from psa_casadi.report.page.live import doubles, live_data
-from psa_casadi.units import FloatArray
 from tests.report.browser import Browser, driven, script
 
 

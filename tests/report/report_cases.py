@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis import corrections, result
 from psa_casadi.diagnosis.held_out import Errors, Gain, Share, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit, misfit
@@ -16,12 +17,11 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import Simulated, measured
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.identify import StackIdentification, identify
+from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.records import multisine, sine, time_grid
 from psa_casadi.records.split import Experiment, split, whole
 from psa_casadi.report.words.series import Curve, Series
 from psa_casadi.simulation.simulate import EXACT, Way
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Interval, Provenance
 
 NOISE = 5e-9
 VERDICTS: tuple[result.Verdict, ...] = get_args(result.Verdict)

@@ -16,10 +16,10 @@ from psa_casadi.design.tracking.targets import respond
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
+from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.report.page import live
 from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.page.live import LiveModel, live_data, live_design, thinned
-from psa_casadi.variables import Interval, Provenance
 from tests.any_model import own_models
 from tests.any_model import own_plants as plants
 from tests.report.browser import DARK, Browser, driven, script

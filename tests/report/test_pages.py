@@ -14,8 +14,8 @@ from plotly.offline import get_plotlyjs
 
 import psa_casadi
 import psa_casadi as psa
-from psa_casadi.notes import note
-from psa_casadi.progress import typed
+from psa_casadi.common.notes import note
+from psa_casadi.common.progress import typed
 from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.words.notes import SENTENCES
 from tests.report.html_page import Page, written

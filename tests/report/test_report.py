@@ -9,6 +9,7 @@ from matplotlib.image import imread
 from scipy.signal import lfilter
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.export.check.check import CheckRow
 from psa_casadi.report.page import results
@@ -18,7 +19,6 @@ from psa_casadi.report.words.fit_words import residual_sentence
 from psa_casadi.report.words.phrases import Scale, number, probability_text
 from psa_casadi.report.words.tables import check_table
 from psa_casadi.report.words.text import check_sentence
-from psa_casadi.units import FloatArray
 from tests.report.html_page import Page, figures, numbers, written
 from tests.report.report_cases import NOISE, diagnosis, long_fit
 from tests.tiers import slow, slow_but

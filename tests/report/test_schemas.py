@@ -12,14 +12,14 @@ import pytest
 
 import psa_casadi as psa
 from build_scripts.schemas import FILES, schema_texts
+from psa_casadi.common.strict_json import json_text
 from psa_casadi.diagnosis.corrections import Patch
 from psa_casadi.diagnosis.result import Alternative
+from psa_casadi.documents.files import check_file, identification_file
 from psa_casadi.export.check.rows import CheckRow, stopped
 from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.ports import with_ports
-from psa_casadi.report.documents.files import check_file, identification_file
-from psa_casadi.strict_json import json_text
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
 from tests.model.evidence_models import evident_model
 from tests.report.report_cases import diagnosis, identification, with_periodic

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.cache import cached
+from psa_casadi.common.cache import cached
 from psa_casadi.simulation import device, many
 from psa_casadi.simulation.compiler import compiler_command, run_compiler
 

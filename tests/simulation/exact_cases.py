@@ -5,13 +5,13 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Component, Equations
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Parameter, State
 from tests.model.stack_models import at_ordinary_size, stack
 
 OUTPUT = "measured_displacement"

@@ -14,12 +14,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from psa_casadi import cache, files
-from psa_casadi.components import BASE
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.common import cache, files
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.files import replace_durably
 from psa_casadi.export.fmu.platforms import PLATFORMS, chosen_platforms, compile_library
 from psa_casadi.export.fmu.platforms import host_platform as host
-from psa_casadi.files import replace_durably
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
 from psa_casadi.simulation import compiler
 from psa_casadi.simulation.compiler import generate_c
@@ -333,7 +333,7 @@ def test_a_full_disk_is_tried_once(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         replace_durably(source, target)
 
-    monkeypatch.setattr("psa_casadi.cache.replace_durably", full)
+    monkeypatch.setattr("psa_casadi.common.cache.replace_durably", full)
     assert [value(library(n)) for n in (1, 2, 3)] == [1, 2, 3]
     assert len(calls) == 4
     assert not list((tmp_path / "cache" / "models").iterdir())

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from psa_casadi import reference
-from psa_casadi.component import Component, Equations
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.model.component import Component, Equations
+from psa_casadi.model.components import BASE, SIMPLIFIED
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.model.structure import structure_of
 from psa_casadi.records import read_record
@@ -27,7 +28,6 @@ from psa_casadi.simulation.exact.run import run_exact, why_not
 from psa_casadi.simulation.exact.split import Split, split_of
 from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, record_inputs, simulate
 from psa_casadi.simulation.start import start_on
-from psa_casadi.units import FloatArray
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack

@@ -6,16 +6,16 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.record import Record
 from psa_casadi.simulation import device
 from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on, starts_on
-from psa_casadi.units import FloatArray
 from tests.model.stack_models import stack
 from tests.simulation.cuda_host import HostCuda, lend
 from tests.simulation.exact_cases import KINK

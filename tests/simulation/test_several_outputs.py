@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.simulate import EXACT, STEPPER, Traced, Way, trace
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
 from tests.any_model import own_models
 from tests.simulation.exact_cases import composite, inputs, times, with_effect
 

@@ -10,10 +10,10 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import CliRunner
 
 from psa_casadi.cli.app import app
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import MachineError
+from psa_casadi.common.errors import MachineError
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, Structure, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records import write_record
 from psa_casadi.records.excitation import time_grid, triangle
 from psa_casadi.report.words.tables import timings_table

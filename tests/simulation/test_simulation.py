@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from psa_casadi.components import BASE
-from psa_casadi.components.stack import DRIVE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.components import BASE
+from psa_casadi.model.components.stack import DRIVE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.structure import structure_of
 from psa_casadi.simulation.compiler import fingerprint, generate_c
 from psa_casadi.simulation.simulate import input_samples, simulate
 from psa_casadi.simulation.start import start_state
 from psa_casadi.simulation.stepper import SimulationError, run
-from psa_casadi.units import FloatArray
 from tests.model.stack_models import LINEAR, jacobian, sine, stack
 
 

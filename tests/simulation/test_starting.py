@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from psa_casadi.components import SIMPLIFIED
-from psa_casadi.effects import EFFECTS
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.model.components import SIMPLIFIED
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.model.variables import Provenance
 from psa_casadi.records import Record
 from psa_casadi.simulation.simulate import simulate
-from psa_casadi.variables import Provenance
 
 TIME = np.linspace(0.0, 0.02, 400)
 VOLTAGE = 50.0 * (1.0 - np.cos(2 * np.pi * 100.0 * TIME))

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from psa_casadi.component import Component, Equations, Symbols
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Component, Equations, Symbols
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model, compose
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.ports import ports_of, with_ports
+from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.simulate import Way, input_samples, trace
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.tangent import answer, course_of, law_of, opened
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Parameter, State
 from tests.any_model.own_models import oscillator
 
 _WAY = Way(1e-8, 1e-8)

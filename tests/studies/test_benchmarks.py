@@ -12,10 +12,10 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import psa_casadi as psa
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
-from psa_casadi.units import ComplexArray, FloatArray
 from tests.datasets.test_datasets_one_axis import N as PERIOD
 from tests.studies.__main__ import app
 from tests.studies.benchmarks import changed, floors, mirror, names, peers, sampling

@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import parse_unit
 from psa_casadi.records import read_record
-from psa_casadi.units import parse_unit
 from tests.tiers import slow
 
 if not hasattr(os, "fork"):

@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from psa_casadi.children import end_with_parent
+from psa_casadi.common.children import end_with_parent
 
 TRIED = {"evidence": 0.0, "score": 0.0, "rms_m": 2e-7, "holdout_rms_m": 2e-7, "base_rms_m": 2e-7,
          "noise_rms_m": 1e-8}  # fmt: skip

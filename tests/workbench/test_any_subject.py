@@ -12,8 +12,8 @@ import psa_casadi as psa
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.web import _subject
-from psa_casadi.workbench.desk import Desk
-from psa_casadi.workbench.server import served
+from psa_casadi.cli.workbench.desk import Desk
+from psa_casadi.cli.workbench.server import served
 from tests.export.supplied import INFLOW, TIMES, lagged, level, supplied
 from tests.test_files import posix
 from tests.tiers import slow

@@ -17,11 +17,11 @@ import pytest
 
 from psa_casadi.cli import web
 from psa_casadi.cli.inputs import Inputs
-from psa_casadi.errors import InputError
-from psa_casadi.workbench.desk import Desk, Limits, stored_name
-from psa_casadi.workbench.previews import Subject
-from psa_casadi.workbench.run import Run
-from psa_casadi.workbench.server import Server, served
+from psa_casadi.cli.workbench.desk import Desk, Limits, stored_name
+from psa_casadi.cli.workbench.previews import Subject
+from psa_casadi.cli.workbench.run import Run
+from psa_casadi.cli.workbench.server import Server, served
+from psa_casadi.common.errors import InputError
 from tests.contract.test_commands import request
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
@@ -327,7 +327,7 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
         there.append([*sys.path])
         raise InputError("no server")
 
-    monkeypatch.setattr("psa_casadi.workbench.server.served", no_server)
+    monkeypatch.setattr("psa_casadi.cli.workbench.server.served", no_server)
     (tmp_path / "gratings.py").write_text(RIPPLE)
     for first in ("", str(tmp_path)):
         for modules in ([], ["gratings"]):

@@ -48,9 +48,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.limits import Limits
 from psa_casadi.diagnosis.colour import Colour, colour_of
-from psa_casadi.errors import InputError, PsaError
 from psa_casadi.identification.fitting.fit import Fit, unknowns_around
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.identification.fitting.prediction import OUTPUT, trace_record
@@ -67,7 +68,6 @@ from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Traced, Way
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

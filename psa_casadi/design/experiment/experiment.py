@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 import scipy
 
-from psa_casadi.component import Component
+from psa_casadi.common.display import with_units
+from psa_casadi.common.errors import InputError, Problems, PsaError, quoted
+from psa_casadi.common.notes import note
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.criteria import (
     LEAST,
     Information,
@@ -29,16 +33,12 @@ from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
-from psa_casadi.display import with_units
-from psa_casadi.errors import InputError, Problems, PsaError, quoted
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import note
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.start import is_stack
-from psa_casadi.units import FloatArray
 
 #: How often a record may be played until it names the cause, and the probability demanded.
 PLAYS, CHANCE = (1, 2, 3, 5), 0.9

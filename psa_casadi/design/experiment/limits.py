@@ -13,10 +13,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records.excitation import time_grid
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
 
 #: Bandwidth over the sampling rate by default: twenty samples for a whole cycle.
 BAND = 0.05

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.interruption import interruptible_work
+from psa_casadi.common.progress import Progress, on_a_terminal, silent
 from psa_casadi.design.experiment.criteria import (
     Optimality,
     Rival,
@@ -32,16 +34,14 @@ from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
 from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, search_starts
 from psa_casadi.identification.search import CORE
-from psa_casadi.interruption import interruptible_work
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.ports import with_ports
-from psa_casadi.progress import Progress, on_a_terminal, silent
 from psa_casadi.records.signals import Hold
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.sizes import sized, sizes_of

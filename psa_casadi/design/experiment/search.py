@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import scipy
 
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.criteria import Criterion, Point
 from psa_casadi.design.experiment.limits import KINDS, Drive, Kind, Limits, draw
-from psa_casadi.errors import PsaError
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra, side_by_side
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
 
 #: Makes a planned record: its name, instants (n,) [s], inputs (n,) by name.
 Make = Callable[[str, FloatArray, Mapping[str, FloatArray]], Signals]

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.model.compose import Model
-from psa_casadi.units import ComplexArray, FloatArray
 
 #: Where a mechanism acts.
 ACTS_ON = ("wafers", "tip")

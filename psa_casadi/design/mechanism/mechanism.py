@@ -22,7 +22,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.components.surroundings import PRESTRESS_MECHANISM, PRESTRESS_MOUNTS, PRESTRESS_PORT
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.interruption import raise_if_stopped
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.design.mechanism.loop import (
     Mechanics,
     Mounting,
@@ -35,11 +37,13 @@ from psa_casadi.design.mechanism.loop import (
     step_response,
     stroke_loss,
 )
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.model.components.surroundings import (
+    PRESTRESS_MECHANISM,
+    PRESTRESS_MOUNTS,
+    PRESTRESS_PORT,
+)
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.units import ComplexArray, FloatArray
-from psa_casadi.variables import Provenance
+from psa_casadi.model.variables import Provenance
 
 
 def product(a: Any, b: Any) -> Any:

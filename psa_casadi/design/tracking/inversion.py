@@ -18,6 +18,8 @@ import casadi as ca
 import numpy as np
 import scipy
 
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking.targets import (
     AmplifierLimits,
     Response,
@@ -29,11 +31,9 @@ from psa_casadi.design.tracking.targets import (
     respond,
     rest_at,
 )
-from psa_casadi.errors import InputError, Problems
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record
 from psa_casadi.simulation.start import LinearPart, linear_part
-from psa_casadi.units import FloatArray
 
 #: Response over that at rest, below which the inverse rolls off.
 ROLL_OFF = 0.03

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 import scipy
 
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_start, respond
-from psa_casadi.errors import PsaError
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import slopes_at_rest
-from psa_casadi.units import FloatArray
 
 _SLACK = 1e-7  # sum of the distances from rest, over nominal, that counts as arrived
 _PRECISION = 1e-3  # of the length

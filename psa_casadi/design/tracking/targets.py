@@ -7,7 +7,8 @@ from math import inf
 import casadi as ca
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import BoolArray, FloatArray, parse_unit, to_si
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import runs_of
 from psa_casadi.records.read import apart
@@ -15,7 +16,6 @@ from psa_casadi.records.read.samples import Request
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import linear_part, start_state
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import BoolArray, FloatArray, parse_unit, to_si
 
 #: Fewest samples of a path.
 _FEWEST = 10

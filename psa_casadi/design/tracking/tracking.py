@@ -21,7 +21,9 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.component import Expression
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.interruption import raise_if_stopped
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking.inversion import InvertedInput, invert
 from psa_casadi.design.tracking.targets import (
     AmplifierLimits,
@@ -37,12 +39,10 @@ from psa_casadi.design.tracking.targets import (
     rest_at,
     smooth_form,
 )
-from psa_casadi.errors import InputError, PsaError
-from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
 
 NODES = (1.0 / 3.0, 1.0)
 _WEIGHTS = ((5.0 / 12.0, -1.0 / 12.0), (3.0 / 4.0, 1.0 / 4.0))

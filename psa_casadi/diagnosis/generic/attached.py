@@ -4,7 +4,8 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from psa_casadi.component import (
+from psa_casadi.common.errors import InputError
+from psa_casadi.model.component import (
     Component,
     Equations,
     Expression,
@@ -13,12 +14,11 @@ from psa_casadi.component import (
     Remedy,
     Symbols,
 )
-from psa_casadi.errors import InputError
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, parameter_ports, ports_of, with_ports
-from psa_casadi.shapes import ANGLES
+from psa_casadi.model.shapes import ANGLES
+from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.variables import Parameter, State
 
 #: An ordinary size of an effect over what it acts on, and the largest that a fit may reach.
 ORDINARY, LARGEST = 0.03, 10.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from psa_casadi.component import Expression, Symbols
+from psa_casadi.common.units import rate_unit
 from psa_casadi.diagnosis.generic.attached import (
     LARGEST,
     ORDINARY,
@@ -22,11 +22,11 @@ from psa_casadi.diagnosis.generic.attached import (
 )
 from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.model import ports
+from psa_casadi.model.component import Expression, Symbols
 from psa_casadi.model.compose import Model
-from psa_casadi.shapes import magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.model.shapes import magnitude_power, signed_power, smooth_magnitude
+from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.units import rate_unit
-from psa_casadi.variables import Parameter, State
 
 #: Ordinary sizes at which a memory is looked for: the derivative at 0 holds little information on
 #: one that acts in full.

@@ -11,7 +11,6 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Expression, Symbols
 from psa_casadi.diagnosis.generic.attached import (
     LARGEST,
     ORDINARY,
@@ -23,10 +22,11 @@ from psa_casadi.diagnosis.generic.attached import (
     scale_of,
     size_of,
 )
+from psa_casadi.model.component import Expression, Symbols
 from psa_casadi.model.ports import Port, true_sum
-from psa_casadi.shapes import pade_section, softplus
+from psa_casadi.model.shapes import pade_section, softplus
+from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.sizes import Sizes
-from psa_casadi.variables import Parameter, State
 
 #: Width of the rounded corner of a saturation or a dead zone, over the signal's size: usual, and
 #: the least and the most that a fit may reach. A wider corner is a bend.

@@ -9,6 +9,7 @@ one of them is better; where much is left, from another base and with all effect
 
 import numpy as np
 
+from psa_casadi.common.notes import note
 from psa_casadi.diagnosis import base_fit
 from psa_casadi.diagnosis.colour import noise_rms
 from psa_casadi.diagnosis.families import CauseEvidence
@@ -16,9 +17,8 @@ from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.state import FINALISTS, NONE, Names, SearchState
-from psa_casadi.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.notes import note
+from psa_casadi.model.effects.mechanics import STRUCTURAL_MODE
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import Work, counted, stage
 

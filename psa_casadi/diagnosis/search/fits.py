@@ -6,18 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
 from psa_casadi.diagnosis.screening import Copy, Score, Together
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis, near_end
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
 from psa_casadi.identification.refitting import quick_rtol, refit, weighted
 from psa_casadi.identification.start.ordinary import has_loop, ordinary_values
+from psa_casadi.model.component import Component
+from psa_casadi.model.variables import Parameter
 from psa_casadi.records.split import Experiment, fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import is_stack
-from psa_casadi.variables import Parameter
 
 #: Evaluations of a quick fit from a direction; with what it held, free again.
 QUICK, _FREED = 8, 3

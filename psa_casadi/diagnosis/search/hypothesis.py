@@ -20,7 +20,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import scipy
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
 from psa_casadi.diagnosis.noise import known_colour
@@ -39,12 +40,11 @@ from psa_casadi.diagnosis.screening import (
     whitened_residuals,
 )
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.model.component import Component
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.stepper import SimulationError
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,25 +5,25 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.screening import Copy, Score, best_sets, copies, temperature
 from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.state import FINALISTS, NEAR, SearchState, nearly
-from psa_casadi.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
-from psa_casadi.errors import PsaError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Response, modes_of
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
+from psa_casadi.model.scales import stiffness_scale
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
-from psa_casadi.scales import stiffness_scale
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import accurate, record_inputs
 from psa_casadi.simulation.start import start_on
 from psa_casadi.simulation.timings import stage
-from psa_casadi.units import FloatArray
 
 #: Samples of all records from which modes are read off; evaluations of the fit.
 _ENOUGH, _EVALUATIONS = 20_000, 20

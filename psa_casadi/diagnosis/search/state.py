@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from psa_casadi.component import Component
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
 from psa_casadi.diagnosis.pack import Task, is_dynamic
 from psa_casadi.diagnosis.search.fits import as_led, cost_beside, refit_at_bound, to_end
@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.search.hypothesis import (
 from psa_casadi.diagnosis.task import State, Tried
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.refitting import relevelled
-from psa_casadi.notes import Note
+from psa_casadi.model.component import Component
 from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Share of the best one's evidence from which neighbours are nearly as likely, and distance from it

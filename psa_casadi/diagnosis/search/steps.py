@@ -3,7 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.omnibus import Omnibus
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.result import Contender
@@ -24,17 +27,14 @@ from psa_casadi.diagnosis.search.hypothesis import (
 )
 from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Thresholds, same_curves
-from psa_casadi.errors import InputError
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.prepare import as_read
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import chosen_start
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
-from psa_casadi.progress import Progress, silent
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, whole
-from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,21 +10,21 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.strict_json import read_json
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.rows import BREAKDOWNS
 from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, main_output, played_inputs
 from psa_casadi.export.fmu import reference_run
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
 from psa_casadi.export.importer.masters import Signals
+from psa_casadi.model.components import BASE, SIMPLIFIED
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.reference import Signal, from_samples, simulate
 from psa_casadi.simulation.simulate import settled_at
 from psa_casadi.simulation.stepper import run
-from psa_casadi.strict_json import read_json
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 
 @dataclass(frozen=True)

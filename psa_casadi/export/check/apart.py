@@ -18,12 +18,12 @@ from contextlib import suppress
 from dataclasses import astuple
 from pathlib import Path
 
-from psa_casadi.children import end_with_parent, heard, kill_group, started_python
-from psa_casadi.errors import PsaError
+from psa_casadi.common.children import end_with_parent, heard, kill_group, started_python
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.processes import memory_of_process
 from psa_casadi.export.check.measured import Task, checks_of
 from psa_casadi.export.check.rows import CheckRow, stopped
-from psa_casadi.files import temporary_folder
-from psa_casadi.processes import memory_of_process
 
 #: The row that is there only if the process ends badly outside of any check.
 OUTSIDE = "process ends"

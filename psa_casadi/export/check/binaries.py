@@ -15,7 +15,7 @@ from typing import Any
 import fmpy.fmi2
 import fmpy.fmi3
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES, Check, CheckRow, plain
 from psa_casadi.export.fmu.platforms import PLATFORMS, host_platform
 from psa_casadi.export.importer.archive import Archive

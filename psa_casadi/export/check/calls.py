@@ -7,8 +7,8 @@ from functools import partial
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
-from psa_casadi.units import FloatArray
 
 Problems = Iterator[str]
 

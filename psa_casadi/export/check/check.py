@@ -8,9 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from psa_casadi.component import Component
-from psa_casadi.components.outputs import OUTPUT as VALIDITY
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.files import requests_to_end_answered, why_not_read
+from psa_casadi.common.strict_json import read_json
 from psa_casadi.export.check import binaries, description
 from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
 from psa_casadi.export.check.apart import OVERTIME, rows_apart
@@ -30,11 +30,11 @@ from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.export.fmu.evidence import with_validity
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive, archive_problems
-from psa_casadi.files import requests_to_end_answered, why_not_read
+from psa_casadi.model.component import Component
+from psa_casadi.model.components.outputs import OUTPUT as VALIDITY
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import model_of
 from psa_casadi.records.record import Record
-from psa_casadi.strict_json import read_json
 
 __all__ = ["CheckReport", "CheckRow", "check_fmu"]
 

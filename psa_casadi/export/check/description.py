@@ -10,8 +10,8 @@ import casadi as ca
 import fmpy
 from fmpy.model_description import ValidationError
 
-from psa_casadi.component import KeptEquations
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import parse_unit
 from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.common import publication
 from psa_casadi.export.common.markup import generation_tool
@@ -20,9 +20,9 @@ from psa_casadi.export.fmu import sources
 from psa_casadi.export.fmu.archive import planned_step
 from psa_casadi.export.fmu.description import Key, at_the_start, dependencies, without_sampled
 from psa_casadi.export.importer.archive import Archive
+from psa_casadi.model.component import KeptEquations
 from psa_casadi.model.compose import Model
-from psa_casadi.units import parse_unit
-from psa_casadi.variables import Publication
+from psa_casadi.model.variables import Publication
 
 _BASE = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 #: Names by FMI's grammar of the convention "structured" (FMI 2.0.4, 2.2.9; FMI 3.0.2, 2.4.7.5.1), a

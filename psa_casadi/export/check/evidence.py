@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.parameter_sets import MOST_SAMPLES

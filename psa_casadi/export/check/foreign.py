@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.processes import memory_of_process
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.calls import taken_in_turn
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, plain
 from psa_casadi.export.check.structure import difference_error, evaluate
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
-from psa_casadi.processes import memory_of_process
-from psa_casadi.units import FloatArray
 
 #: Internal steps in one step, at most.
 _MOST_INTERNAL = 100

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check import structure
 from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
@@ -20,7 +21,6 @@ from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
-from psa_casadi.units import FloatArray
 
 #: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
 #: inputs cannot move within a step, see `_played`.

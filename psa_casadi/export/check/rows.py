@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
 
 #: What a check may raise on an FMU that is not as expected; the row then did not pass.
 BREAKDOWNS = (

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import Truth
 from psa_casadi.export.common.variable_table import INPUT_LINE, START_VOLTAGE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
-from psa_casadi.units import FloatArray
 
 _POINTS, _TOLERANCE = 4, 1e-10
 #: Knowns and unknowns whose derivatives through a step are compared.

@@ -7,11 +7,11 @@ from xml.etree import ElementTree as ET
 import casadi as ca
 import numpy as np
 
-from psa_casadi.characters import check_text
-from psa_casadi.component import Expression
+from psa_casadi.common.characters import check_text
+from psa_casadi.common.units import FloatArray, Unit
 from psa_casadi.export.common.templates import filled
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray, Unit
 from psa_casadi.version import __version__
 
 _FORCE_SCALE = {

@@ -16,9 +16,9 @@ from statistics import NormalDist
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray, parse_unit
 from psa_casadi.export.common.markup import base_unit, generation_tool, number, xml_text
 from psa_casadi.model.compose import Model
-from psa_casadi.units import FloatArray, parse_unit
 
 #: Name, meaning, value and unit of a parameter.
 Row = tuple[str, str, float, str]

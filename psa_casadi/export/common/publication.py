@@ -8,7 +8,7 @@ Source: FMI 2.0.5, section 2.3, and FMI 3.0.2, section 2.5.1.2 (documentation/li
 
 from importlib.resources import files
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure

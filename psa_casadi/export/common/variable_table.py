@@ -4,11 +4,11 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import rate_unit
 from psa_casadi.model.compose import Model
-from psa_casadi.scales import velocity_scale
-from psa_casadi.units import rate_unit
-from psa_casadi.variables import Input, Output, State, nominal_value
+from psa_casadi.model.scales import velocity_scale
+from psa_casadi.model.variables import Input, Output, State, nominal_value
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Expression
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fixed_step.step import StepExpression, with_numbers
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.printing import LEAVES, Graph, Unprintable
 

@@ -15,22 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.components import BASE, SIMPLIFIED
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write, make_folder
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.markup import generation_tool
 from psa_casadi.export.common.publication import code_license, refuse_foreign
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fixed_step import code
 from psa_casadi.export.fixed_step.code import PRECISIONS, CodePlan, Precision, probe_code
 from psa_casadi.export.fixed_step.step import step_of
-from psa_casadi.files import atomic_write, make_folder
+from psa_casadi.model.components import BASE, SIMPLIFIED
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.simulation.compiler import shared_library
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.simulate import output_of
 from psa_casadi.simulation.stepper import SimulationError, run
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 #: Steps of a reference voltage.
 STEPS = 1000

@@ -24,12 +24,12 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from psa_casadi.component import Expression
+from psa_casadi.common.units import FloatArray
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
 from psa_casadi.model.structure import Structure
+from psa_casadi.model.variables import Input
 from psa_casadi.simulation.exact.split import Split, closure, jumping, split_of
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Input
 
 #: Shortest leg over a step: below it a rate has no meaning, and nothing happens.
 _SHORTEST = 1e-6

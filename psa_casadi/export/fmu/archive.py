@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_path
 from psa_casadi.export.common.icon import ICONS, drawing_of, png
 from psa_casadi.export.common.parameter_sets import SAMPLES
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text, refuse_foreign
@@ -19,7 +20,6 @@ from psa_casadi.export.fmu.platforms import chosen_platforms, compile_library
 from psa_casadi.export.fmu.reference_run import held_step, reference_entries
 from psa_casadi.export.fmu.sources import FACES, FIXED_ENTRY, exported_texts, fixed_entry, use_of
 from psa_casadi.export.fmu.terminals import terminal_entries
-from psa_casadi.files import atomic_path
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation.stepper import SimulationError

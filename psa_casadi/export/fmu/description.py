@@ -12,6 +12,7 @@ from functools import cache
 
 import casadi as ca
 
+from psa_casadi.common.units import Unit, parse_unit
 from psa_casadi.export.common.markup import (
     base_unit,
     default_span,
@@ -29,7 +30,6 @@ from psa_casadi.export.common.variable_table import (
 )
 from psa_casadi.export.fixed_step.export import FixedStep
 from psa_casadi.model.compose import Model, Structure
-from psa_casadi.units import Unit, parse_unit
 
 Key = tuple[str, int]
 

@@ -6,7 +6,8 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from psa_casadi.characters import check_text
+from psa_casadi.common.characters import check_text
+from psa_casadi.common.units import convert
 from psa_casadi.export.common.icon import ICONS, drawing_of, svg
 from psa_casadi.export.common.markup import force_scale, generation_tool, time_scale, what_it_is
 from psa_casadi.export.common.publication import LICENSE_ENTRY
@@ -16,7 +17,6 @@ from psa_casadi.export.fmu.evidence import META_DATA, PAGE, RELATED
 from psa_casadi.export.fmu.reference_run import FOLDER, NOTES, SHARE, STEPS_PER_PERIOD, HeldStep
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import STACKS
-from psa_casadi.units import convert
 
 ENTRY = "documentation/index.html"
 #: Movement within the time that the model needs to settle, over the nominal size, that is none.

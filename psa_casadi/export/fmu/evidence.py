@@ -11,9 +11,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from psa_casadi.characters import check_text
-from psa_casadi.components.outputs import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
-from psa_casadi.errors import InputError
+from psa_casadi.common.characters import check_text
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.markup import generation_tool, number, xml_text
 from psa_casadi.export.common.parameter_sets import parameter_set, posterior_sets
 from psa_casadi.export.common.templates import filled
@@ -28,13 +28,13 @@ from psa_casadi.export.fmu.reference_run import (
     experiments,
     rounded,
 )
+from psa_casadi.model.components.outputs import OUTPUT, VALIDITY, VALIDITY_WITH_TEMPERATURE
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import (
     Evidence,
     ReferenceRun,
 )
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
 
 
 def with_validity(model: Model) -> Model:

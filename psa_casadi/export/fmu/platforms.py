@@ -8,10 +8,10 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
-from psa_casadi.cache import cached
-from psa_casadi.errors import InputError
+from psa_casadi.common.cache import cached
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import temporary_folder
 from psa_casadi.export.fmu.sources import compiled_files
-from psa_casadi.files import temporary_folder
 from psa_casadi.simulation.compiler import (
     INSTALL_ZIG,
     OPTIMISE,

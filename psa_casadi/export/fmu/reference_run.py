@@ -20,13 +20,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.markup import number, time_scale, xml_text
 from psa_casadi.export.common.parameter_sets import parameter_set
 from psa_casadi.export.common.templates import filled
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 FOLDER = "extra/org.fmi-standard.fmi-ls-ref"
 NOTES = "documentation/fmi-ls-ref.txt"

@@ -17,7 +17,6 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Expression
 from psa_casadi.export.common.markup import at_rest, xml_text
 from psa_casadi.export.common.publication import SOURCES_NOTICE, code_license
 from psa_casadi.export.common.templates import filled
@@ -26,6 +25,7 @@ from psa_casadi.export.fixed_step.code import bounded, function_code, limit_word
 from psa_casadi.export.fixed_step.export import STEPS, FixedStep, main_output
 from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import seen_inputs
+from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import (
     OPTIMISE,

@@ -19,8 +19,8 @@ from typing import Any, Self
 
 import fmpy
 
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.files import temporary_folder
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.files import temporary_folder
 
 #: Most entries of an archive, and most bytes of all of them.
 MOST_ENTRIES, MOST_BYTES = 10_000, 1 << 30

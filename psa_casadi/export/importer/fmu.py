@@ -17,9 +17,9 @@ import fmpy
 import numpy as np
 from fmpy import fmi1, fmi2, fmi3
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.archive import Archive
-from psa_casadi.units import FloatArray
 
 MODEL_EXCHANGE, CO_SIMULATION = 0, 1
 #: As often an FMU may ask for another update of its discrete states.

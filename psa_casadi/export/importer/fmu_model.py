@@ -13,8 +13,8 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, FmuUsed, Foreign, Symbols
-from psa_casadi.errors import InputError, Problems, PsaError, quoted
+from psa_casadi.common.errors import InputError, Problems, PsaError, quoted
+from psa_casadi.common.units import parse_unit
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.imported import (
     TIME_EVENT,
@@ -25,10 +25,10 @@ from psa_casadi.export.importer.imported import (
     opened,
 )
 from psa_casadi.export.importer.played import Played, PlayedEquations
+from psa_casadi.model.component import Component, Equations, Expression, FmuUsed, Foreign, Symbols
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import model_of, no_fmu, read_content
-from psa_casadi.units import parse_unit
-from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
+from psa_casadi.model.variables import Input, Output, Parameter, State, nominal_value
 
 #: What `free` may be: names, or names with bounds or whole declarations.
 Free = Sequence[str] | Mapping[str, tuple[float, float] | Parameter | None]

@@ -20,9 +20,9 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import FmuUsed, Foreign
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.export.importer.fmu import MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.model.component import FmuUsed, Foreign
 from psa_casadi.simulation.compiler import shared_library
 
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 import scipy
 
+from psa_casadi.common.files import temporary_folder
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
-from psa_casadi.files import temporary_folder
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
-from psa_casadi.units import FloatArray
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 from fmpy.sundials import CVodeSolver
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, NO_MESSAGE, Fmu, FmuError
 from psa_casadi.export.importer.imported import opened
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.units import FloatArray
 
 #: Relative tolerance of a run by model exchange; CVode's.
 _TOLERANCE = 1e-7

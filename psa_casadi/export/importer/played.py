@@ -21,21 +21,21 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Component, Equations, Expression, Symbols
-from psa_casadi.errors import InputError, MachineError
+from psa_casadi.common.errors import InputError, MachineError
+from psa_casadi.common.interruption import raise_if_stopped
+from psa_casadi.common.processes import Processes
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.fmu import CO_SIMULATION
 from psa_casadi.export.importer.play import Run, play
-from psa_casadi.interruption import raise_if_stopped
+from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.model.ports import Opened, ported
-from psa_casadi.processes import Processes
+from psa_casadi.model.variables import Input, Output
 from psa_casadi.simulation.exact.split import closure, dependence
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError, Steps, run
-from psa_casadi.symbolic import in_turn
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Input, Output
 
 #: Step of a difference over the usual size of a parameter: far above what a solver with a tolerance
 #: of 1e-6 errs by, and small enough for a slope that is right to a thousandth.

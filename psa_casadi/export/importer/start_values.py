@@ -9,15 +9,15 @@ from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from psa_casadi.component import Component, Foreign
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.files import atomic_path, atomic_write
+from psa_casadi.common.notes import Note, note
 from psa_casadi.export.common.parameter_sets import parameter_rows, set_text
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import digest_of, opened
-from psa_casadi.files import atomic_path, atomic_write
+from psa_casadi.model.component import Component, Foreign
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 
 _DESCRIPTION = "modelDescription.xml"
 #: Values that differ by this share are the same: those of a Float32.

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from psa_casadi.component import Expression, Symbols
 from psa_casadi.export.common.icon import drawing_of
 from psa_casadi.export.common.templates import filled
 from psa_casadi.export.modelica.expression import (
@@ -26,11 +25,12 @@ from psa_casadi.export.modelica.expression import (
     string,
     unit_text,
 )
+from psa_casadi.model.component import Expression, Symbols
 from psa_casadi.model.compose import Model
+from psa_casadi.model.scales import static_stiffness, stroke
+from psa_casadi.model.shapes import direction, magnitude_power, rate_magnitude, signed_power
 from psa_casadi.model.structure import Structure
-from psa_casadi.scales import static_stiffness, stroke
-from psa_casadi.shapes import direction, magnitude_power, rate_magnitude, signed_power
-from psa_casadi.variables import Input, Output, Parameter, State, nominal_value
+from psa_casadi.model.variables import Input, Output, Parameter, State, nominal_value
 
 _WIDTH = 100
 #: The signals that a connector replaces, and those of them that it determines.

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 import casadi as ca
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from psa_casadi.model.graph import PLAINLY, ExpressionGraph, square
 
 #: CasADi's operations that are printed under their names in CasADi; the others follow.

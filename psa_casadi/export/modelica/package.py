@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from psa_casadi.characters import check_text
-from psa_casadi.effects.mechanics import RECIPROCAL_COUPLING
-from psa_casadi.errors import Problems
+from psa_casadi.common.characters import check_text
+from psa_casadi.common.errors import Problems
+from psa_casadi.common.files import atomic_write
 from psa_casadi.export.common.icon import ICONS, SIDE, drawing_of
 from psa_casadi.export.common.markup import describe, generation_tool, time_scale
 from psa_casadi.export.common.publication import refuse_foreign
@@ -36,10 +36,10 @@ from psa_casadi.export.modelica.expression import (
     string,
     unit_text,
 )
-from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model
-from psa_casadi.scales import stiffness_scale
-from psa_casadi.variables import Input, nominal_value
+from psa_casadi.model.effects.mechanics import RECIPROCAL_COUPLING
+from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.variables import Input, nominal_value
 
 
 def export_modelica(

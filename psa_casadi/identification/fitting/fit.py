@@ -19,7 +19,9 @@ from functools import cached_property
 
 import numpy as np
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
+from psa_casadi.common.interruption import current_work
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.levenberg_marquardt import (
     FIRST_RADIUS,
     LEAST_RADIUS,
@@ -47,14 +49,12 @@ from psa_casadi.identification.fitting.unknowns import (
     memory_prior,
     unknowns_of,
 )
-from psa_casadi.interruption import current_work
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.records.split import DISPLACEMENT, Channel, Experiment, fitted
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.start import is_stack, resting_states
 from psa_casadi.simulation.stepper import SimulationError
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 #: Relative tolerance of a step in fits.
 FIT_RTOL = 1e-6

@@ -11,7 +11,7 @@ from math import sqrt
 
 import numpy as np
 
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 #: theta -> (residual (m,), Jacobian (m, k)), or None where the model cannot be evaluated.
 Evaluate = Callable[[FloatArray], tuple[FloatArray, FloatArray] | None]

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.model.compose import Model
-from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Channel, Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -26,7 +27,6 @@ from psa_casadi.simulation.start import (
     start_for,
     start_state,
 )
-from psa_casadi.units import FloatArray
 
 #: Steps between two samples, and mean ones of a record, beyond which a trial point has failed.
 #: Dozens are ordinary: of 74 runs in 19 diagnoses the means were 25 and less, but for two. The mean

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.model.compose import Model
-from psa_casadi.units import BoolArray, FloatArray
-from psa_casadi.variables import State, nominal_value
+from psa_casadi.model.variables import State, nominal_value
 
 #: Standard deviations of the weak priors: in natural logarithms, and in ordinary changes.
 LOG_PRIOR = 3.0

@@ -6,11 +6,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Numbers whose squares would overflow.
 _LARGEST = 1e30

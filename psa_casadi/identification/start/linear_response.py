@@ -35,8 +35,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from psa_casadi.common.units import BoolArray, ComplexArray, FloatArray
 from psa_casadi.records.noise import filtered
-from psa_casadi.units import BoolArray, ComplexArray, FloatArray
 
 #: Least relative distance of two poles.
 _APART = 3e-3

@@ -21,9 +21,9 @@ from typing import Literal
 import numpy as np
 import scipy
 
-from psa_casadi.components import BASE
-from psa_casadi.components.stack import BOUC_WEN, MEMORY_SPECTRUM
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import note, texts
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.doubts import (
@@ -32,13 +32,13 @@ from psa_casadi.identification.start.doubts import (
     static_slope,
     stray,
 )
+from psa_casadi.model.components import BASE
+from psa_casadi.model.components.stack import BOUC_WEN, MEMORY_SPECTRUM
 from psa_casadi.model.compose import Model, compose
-from psa_casadi.notes import note, texts
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.drive import turns
 from psa_casadi.records.noise import filtered, high_frequency_noise
 from psa_casadi.records.record import Record
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import Interval
 
 #: Forms of the hysteresis by name; `best` is the one that the records prefer.
 Hysteresis = Literal["bouc-wen", "spectrum", "best"]

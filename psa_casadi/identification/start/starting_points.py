@@ -25,6 +25,7 @@ from math import log
 
 import numpy as np
 
+from psa_casadi.common.units import BoolArray, ComplexArray, FloatArray, IndexArray
 from psa_casadi.identification.fitting.levenberg_marquardt import minimise
 from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.linear_response import (
@@ -49,7 +50,6 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
-from psa_casadi.units import BoolArray, ComplexArray, FloatArray, IndexArray
 
 #: Samples that all excerpts together may have, and that one may.
 SAMPLES, MOST = 8_000, 4_000

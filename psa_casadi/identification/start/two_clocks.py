@@ -23,10 +23,10 @@ from math import ceil, floor
 
 import numpy as np
 
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.start.linear_response import first_order, orthonormal, plays
-from psa_casadi.notes import Note, note
 from psa_casadi.records.record import Record
-from psa_casadi.units import BoolArray, FloatArray
 
 #: Beats that a record may hold; phases that are tried, and how much finer than 1/T the rates.
 FEWEST, MOST = 2.0, 24.0

@@ -17,9 +17,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from psa_casadi.children import end_with_parent, heard, started_python
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.files import temporary_folder
+from psa_casadi.common.children import end_with_parent, heard, started_python
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.files import temporary_folder
 from psa_casadi.records.read.columns import MARKS, WORDS, Field, stated_unit
 from psa_casadi.records.read.formats import READERS, ending_of
 from psa_casadi.records.read.samples import Head, Outcome, Request, samples_of

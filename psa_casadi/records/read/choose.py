@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import parse_unit
 from psa_casadi.records.read.columns import (
     COLUMN_OF,
     SI_UNITS,
@@ -31,7 +32,6 @@ from psa_casadi.records.read.columns import (
 )
 from psa_casadi.records.read.table import Table, as_numbers, as_times, evened
 from psa_casadi.records.record import COLUMNS
-from psa_casadi.units import parse_unit
 
 #: The quantities of the columns that every record has.
 QUANTITIES = {"time": "time", "voltage": "voltage", "displacement": "length"}

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import UNITS, parse_unit, units_of
 from psa_casadi.records.record import COLUMNS, Column
-from psa_casadi.units import UNITS, parse_unit, units_of
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,11 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import ArrayLike
 
-from psa_casadi.characters import plain
-from psa_casadi.display import with_units
-from psa_casadi.errors import InputError, Problems
-from psa_casadi.files import atomic_write
+from psa_casadi.common.characters import plain
+from psa_casadi.common.display import with_units
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.files import atomic_write
+from psa_casadi.common.units import FloatArray, parse_unit, to_si
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.choose import is_rising
 from psa_casadi.records.read.columns import (
@@ -41,7 +42,6 @@ from psa_casadi.records.read.samples import Outcome, Request, samples_of
 from psa_casadi.records.read.table import Cells, Columns, Table, as_numbers, is_stamp, seconds_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.signals import Hold, Signals
-from psa_casadi.units import FloatArray, parse_unit, to_si
 
 
 def parts_of(path: str) -> list[str]:

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems, quoted
+from psa_casadi.common.errors import InputError, Problems, quoted
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.table import (
@@ -33,7 +34,6 @@ from psa_casadi.records.record import (
     check_length,
     check_time,
 )
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 #: A sample time [s] to show where a file has no time.
 _EXAMPLE_STEP = 1e-3

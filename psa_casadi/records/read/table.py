@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray, parse_unit, to_si
 from psa_casadi.records.read.columns import MARKS, unit_named
 from psa_casadi.records.record import FEWEST_SAMPLES
-from psa_casadi.units import BoolArray, FloatArray, IndexArray, parse_unit, to_si
 
 #: The most bytes that a record may have, in its file or unpacked in memory.
 MOST_BYTES = 2**30

@@ -19,7 +19,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from psa_casadi.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.units import FloatArray, to_si, units_of
 from psa_casadi.records.read.columns import (
     columns_known,
     measures,
@@ -43,7 +44,6 @@ from psa_casadi.records.read.table import (
     unit_of_times,
 )
 from psa_casadi.records.record import COLUMNS, FEWEST_SAMPLES
-from psa_casadi.units import FloatArray, to_si, units_of
 
 #: Lines in which the first header is looked for, and the most in which further ones are.
 _MOST_LINES, _MOST_HEADERS = 500, 20_000

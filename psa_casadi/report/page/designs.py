@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.experiment import Informative, Separated
 from psa_casadi.design.mechanism.loop import Mounting, response_times, step_response
 from psa_casadi.design.mechanism.mechanism import MechanismDesign, mounted_model, root_locus
@@ -12,8 +15,6 @@ from psa_casadi.design.tracking.inversion import CorrectedInput, InvertedInput
 from psa_casadi.design.tracking.minimum_time import QuickMove
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, Target, respond
 from psa_casadi.design.tracking.tracking import TrackedInput
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write
 from psa_casadi.model.compose import Model
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.page.document import Picture, render
@@ -22,7 +23,6 @@ from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
 from psa_casadi.report.words.phrases import any_scale, in_brackets, number, plain
-from psa_casadi.units import FloatArray
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
 _HEIGHT, _MOST_POINTS = 360, 4000

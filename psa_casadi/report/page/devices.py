@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from psa_casadi.component import Component
-from psa_casadi.display import frame
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_write
+from psa_casadi.common.display import frame
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write
+from psa_casadi.documents.findings import Result, read_findings
+from psa_casadi.model.component import Component
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Difference, Population, differences
-from psa_casadi.report.documents.findings import Result, read_findings
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.plots import device_plots as plots
 from psa_casadi.report.words import population_words as words

@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import imsave
 from plotly.offline import get_plotlyjs
 
-from psa_casadi.characters import plain
-from psa_casadi.progress import typed
+from psa_casadi.common.characters import plain
+from psa_casadi.common.progress import typed
 from psa_casadi.report.plots.panel import Panel, plotly_figure
 from psa_casadi.report.words import colours, phrases, verdict_words
 from psa_casadi.report.words.tables import Table

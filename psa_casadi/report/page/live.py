@@ -10,21 +10,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.units import FloatArray, IndexArray, convert
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.effects.patches import GAIN
-from psa_casadi.errors import InputError
 from psa_casadi.export.web import future_module
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import record_start
+from psa_casadi.identification.grades import determined
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects.patches import GAIN
 from psa_casadi.model.model_file import dumps
+from psa_casadi.model.variables import Output, Parameter, State
 from psa_casadi.records.signals import Hold, Signals
 from psa_casadi.report.page.document import packed
 from psa_casadi.report.words import colours
-from psa_casadi.report.words.fit_words import determined
 from psa_casadi.report.words.phrases import added, handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
@@ -32,8 +34,6 @@ from psa_casadi.simulation.exact.run import ALIKE
 from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import run
-from psa_casadi.units import FloatArray, IndexArray, convert
-from psa_casadi.variables import Output, Parameter, State
 
 #: Samples of all records in a page, and records; of more, those that the model misses most.
 _SAMPLES, _RECORDS = 12_000, 6

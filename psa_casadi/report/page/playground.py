@@ -8,9 +8,8 @@ import os
 from dataclasses import replace
 from typing import Any
 
-from psa_casadi.components import BASE
-from psa_casadi.effects import EFFECTS
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_write
 from psa_casadi.export.common.markup import default_span, describe, page
 from psa_casadi.export.common.publication import LICENSE_ENTRY, license_text
 from psa_casadi.export.common.variable_table import variable_table
@@ -19,12 +18,13 @@ from psa_casadi.export.fmu.documentation import equations
 from psa_casadi.export.fmu.sources import exported_texts, switch_scales
 from psa_casadi.export.fmu.terminals import terminal_entries
 from psa_casadi.export.web import web_module
-from psa_casadi.files import atomic_write
+from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS, stack_model
+from psa_casadi.model.variables import Provenance
 from psa_casadi.report.page.document import packed, render
 from psa_casadi.report.page.live import live_data
-from psa_casadi.variables import Provenance
 
 #: The stack of a page without a model, and the end of the frequency response [kHz].
 STACK, _BAND = "P-885.51", 100.0

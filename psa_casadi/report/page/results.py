@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.files import atomic_write
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import signature
-from psa_casadi.files import atomic_write
+from psa_casadi.identification import grades
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
@@ -205,7 +206,7 @@ def fit_page(
     stack = identification if isinstance(identification, StackIdentification) else None
     with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
-        graded, tiles = fit_words.grades(identification), []
+        graded, tiles = grades.grades(identification), []
         error = text.fit_sentence(identification) if stack is None else ""
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
@@ -218,7 +219,7 @@ def fit_page(
             ]
             tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
         if fitted := sum(g.degree != "fixed" for g in graded):
-            count = f"{len(fit_words.named(graded, 'determined'))} of {fitted}"
+            count = f"{len(grades.named(graded, 'determined'))} of {fitted}"
             tiles.append(("parameters determined", count, "to 10 % or better"))
         return render(
             "fit.html",
@@ -283,7 +284,7 @@ def _shared(
         f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
     )
     stack = result if isinstance(result, StackIdentification) else None
-    known = fit_words.determined(model, stack)
+    known = grades.determined(model, stack)
     others = [n for n in model.parameter_names if n not in known]
     return {
         "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
@@ -467,15 +468,13 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
     return None if data is None else Picture(data.caption, data.panel, note)
 
 
-def _determined(
-    identification: Identification, graded: tuple[fit_words.Grade, ...]
-) -> list[Picture]:
+def _determined(identification: Identification, graded: tuple[grades.Grade, ...]) -> list[Picture]:
     if not identification.determinacy.names:
         return []
     errors, note = findings.determinacy_plot(graded), fit_words.error_bar_note(graded)
     pictures = [Picture("Relative standard error of each parameter", errors, note)]
     if len(identification.determinacy.names) > 1:
-        words = fit_words.pairs_sentence(fit_words.strong_pairs(identification))
+        words = fit_words.pairs_sentence(grades.strong_pairs(identification))
         plot = findings.correlation_plot(identification)
         pictures.append(Picture("Correlation of the estimates", plot, words))
     return pictures

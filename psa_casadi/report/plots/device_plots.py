@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray, convert
 from psa_casadi.population.finding import NORMAL_95, Finding
 from psa_casadi.population.population import Difference, Population, Spread, display_unit
 from psa_casadi.population.statistics import mixed_regression
@@ -13,7 +14,6 @@ from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import time_scale
-from psa_casadi.units import FloatArray, convert
 
 #: Colours of devices side by side, with dashes and symbols where there are more of them.
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.WEAK, colours.BOUND, colours.MEASURED)

@@ -12,14 +12,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.files import atomic_path
+from psa_casadi.common.units import FloatArray
 from psa_casadi.design.linear import Linear
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
 from psa_casadi.diagnosis.signature import Signature
-from psa_casadi.errors import InputError
-from psa_casadi.files import atomic_path
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.component import Component
+from psa_casadi.model.variables import nominal_value
 from psa_casadi.posterior.chains import column_of
 from psa_casadi.posterior.sample import HDI, Figures, Posterior
 from psa_casadi.posterior.task import Block
@@ -39,8 +41,6 @@ from psa_casadi.report.words.series import (
 )
 from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
 from psa_casadi.simulation.simulate import Trajectory
-from psa_casadi.units import FloatArray
-from psa_casadi.variables import nominal_value
 
 Compared = Diagnosis | Identification
 Plotted = Compared | Trajectory | Posterior | Signals

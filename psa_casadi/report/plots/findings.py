@@ -4,19 +4,19 @@ import math
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray, convert
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
 from psa_casadi.diagnosis.misfit import Misfit, Spectrum
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
 from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.diagnosis.views import View
+from psa_casadi.identification.grades import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.fit_words import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.report.words.misfit_words import AXES
 from psa_casadi.report.words.series import bar_colour
-from psa_casadi.units import FloatArray, convert
 
 #: The colours of the degrees of determinacy, in their order.
 _DEGREE_COLOURS = (colours.EXTENDED, colours.WEAK, colours.BASE, colours.BOUND, colours.NOISE)

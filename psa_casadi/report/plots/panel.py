@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from psa_casadi.characters import plain as carried
+from psa_casadi.common.characters import plain as carried
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import number
 from psa_casadi.report.words.series import compact

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from psa_casadi.common.units import FloatArray, IndexArray
 from psa_casadi.report.plots.panel import Panel, logarithmic, stacked
 from psa_casadi.report.words import colours, series
 from psa_casadi.report.words.phrases import in_brackets
-from psa_casadi.units import FloatArray, IndexArray
 
 Samples = slice | IndexArray
 

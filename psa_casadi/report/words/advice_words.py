@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from psa_casadi.errors import quoted
+from psa_casadi.common.errors import quoted
+from psa_casadi.common.units import convert
 from psa_casadi.identification.advice import Advice, Plan
 from psa_casadi.identification.combinations import Combination
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.words.phrases import listing
-from psa_casadi.units import convert
 
 
 def _branches(missing: Sequence[str]) -> str:

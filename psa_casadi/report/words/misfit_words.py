@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.misfit import Misfit
-from psa_casadi.notes import Note
 from psa_casadi.records.drive import is_mains
 from psa_casadi.report.words.phrases import listing, quantity, signed
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from string import Formatter
 from typing import Any
 
-from psa_casadi.errors import quoted
+from psa_casadi.common.errors import quoted
+from psa_casadi.common.notes import Note
 from psa_casadi.identification.result import Identification
-from psa_casadi.notes import Note
 from psa_casadi.report.words.advice_words import IDENTIFICATION
 from psa_casadi.report.words.misfit_words import ENDINGS, MISFIT, NOISE
 from psa_casadi.report.words.phrases import (

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
+from psa_casadi.common.units import convert
 from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
-from psa_casadi.units import convert
 
 #: A length in a sentence keeps its usual unit where the page's would give a larger number.
 _LARGEST = 1000.0

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from psa_casadi.common.units import convert
 from psa_casadi.diagnosis.held_out import Share
 from psa_casadi.population import population
 from psa_casadi.population.finding import NORMAL_95, Finding
@@ -21,7 +22,6 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.report.words.verdict_words import VERDICTS
-from psa_casadi.units import convert
 
 #: The output of a stack.
 _LENGTH = "displacement"

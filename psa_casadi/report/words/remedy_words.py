@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
-from psa_casadi.component import Component
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
-from psa_casadi.effects import EFFECTS
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.report.words.phrases import (
     Scale,

@@ -7,7 +7,9 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.result import Candidate, Diagnosis, StackDiagnosis
+from psa_casadi.identification.determinacy import NORMAL_95
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
@@ -15,7 +17,6 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,8 +291,6 @@ def compact(values: FloatArray) -> npt.NDArray[np.floating]:
 
 #: Lags at which an autocorrelation is taken, evenly spread over their logarithm.
 _LAGS = 160
-#: Half width of the band that holds 95 % of the autocorrelations of white noise, times sqrt(n).
-_NORMAL_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -366,7 +365,7 @@ def autocorrelation(residual: FloatArray) -> tuple[IndexArray, FloatArray]:
 
 def white_band(residual: FloatArray) -> float:
     """Return the autocorrelation that 95 % of the lags of white noise stay below."""
-    return _NORMAL_95 / float(np.sqrt(np.count_nonzero(np.isfinite(residual))))
+    return NORMAL_95 / float(np.sqrt(np.count_nonzero(np.isfinite(residual))))
 
 
 def distribution(

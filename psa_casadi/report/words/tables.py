@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
-from psa_casadi.component import Component
 from psa_casadi.diagnosis.result import BlindSpot, Diagnosis, StackDiagnosis
-from psa_casadi.effects import EFFECTS
+from psa_casadi.identification.grades import grade
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification, StartOutcome
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
-from psa_casadi.report.words.fit_words import grade
 from psa_casadi.report.words.phrases import (
     Scale,
     added,

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from psa_casadi.component import Component
+from psa_casadi.common.errors import InputError
 from psa_casadi.diagnosis.held_out import Errors
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis, OutputError, StackDiagnosis
-from psa_casadi.errors import InputError
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import in_parts

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Expression
+from psa_casadi.common.units import BoolArray
+from psa_casadi.model.component import Expression
 from psa_casadi.simulation.exact.printing import Printer
 from psa_casadi.simulation.exact.split import Split, closure, dependence
-from psa_casadi.units import BoolArray
 
 _OF_NUMBERS = "real t, const real *x, const real *v, real w, const real *k, real *out"
 _OF_COLUMNS = "const real *d, const column *x, column w, const column *p, column *out"

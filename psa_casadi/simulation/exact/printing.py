@@ -10,8 +10,8 @@ from typing import Any
 
 import casadi as ca
 
-from psa_casadi.component import Expression
-from psa_casadi.symbolic import instructions
+from psa_casadi.common.symbolic import instructions
+from psa_casadi.model.component import Expression
 
 #: (operation, arguments) or ("x", index), ("c", value), ...; equal nodes are one number.
 Node = tuple[Any, ...]

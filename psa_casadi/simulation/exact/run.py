@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from psa_casadi.interruption import flag_address
+from psa_casadi.common.interruption import flag_address
+from psa_casadi.common.symbolic import in_turn
+from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import fingerprint, generated_library, vector_flags
 from psa_casadi.simulation.exact.generate import generate
@@ -22,8 +24,6 @@ from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
 from psa_casadi.simulation.timings import count_run, count_steps
-from psa_casadi.symbolic import in_turn
-from psa_casadi.units import FloatArray
 
 #: A sample is halved this many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12

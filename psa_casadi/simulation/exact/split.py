@@ -19,10 +19,10 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
-from psa_casadi.component import Expression
+from psa_casadi.common.symbolic import in_turn, instructions
+from psa_casadi.common.units import BoolArray
+from psa_casadi.model.component import Expression
 from psa_casadi.model.structure import Structure
-from psa_casadi.symbolic import in_turn, instructions
-from psa_casadi.units import BoolArray
 
 
 def dependence(of: Expression, on: Expression) -> BoolArray:

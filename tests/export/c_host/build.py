@@ -20,11 +20,11 @@ import fmpy
 import numpy as np
 import pytest
 
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, runtime, windows_alone
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
-from psa_casadi.units import FloatArray
 from tests.export.fmu_models import model_named
 
 HERE = Path(__file__).parent

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.population.population import population
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, share
 from tests.studies.plants.base import simulate_base
 from tests.studies.plants.make import write_csv

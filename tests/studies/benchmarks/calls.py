@@ -14,7 +14,7 @@ from typing import Any
 import fmpy
 import numpy as np
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE
 from psa_casadi.export.importer.imported import digest_of
 from psa_casadi.export.importer.play import Run, play

@@ -12,8 +12,8 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi import datasets
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records.drive import reversals
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import Case, names_of, records_of, study
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import (

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.held_out import Gain, gain_of
 from psa_casadi.records.split import Experiment, judging
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import ORDINARY, CaseResult, diagnosed, study
 from tests.studies.benchmarks.records import hidden_record, played_again
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores, share

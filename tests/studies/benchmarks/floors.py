@@ -21,11 +21,11 @@ from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi import datasets
+from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.held_out import Errors, errors_of
 from psa_casadi.identification.fitting.prediction import measured as readings
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.plots.figures import narrow_figure
-from psa_casadi.units import BoolArray, FloatArray, IndexArray
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 

@@ -25,6 +25,7 @@ from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.fixed_step.export import VOLTAGES, fixed_step
 from psa_casadi.export.fmu.sources import compiled_files, exported_texts
@@ -33,7 +34,6 @@ from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, least_times
 
 #: The share of the importer's tolerance that the FMU's solver gives each step (instance.c).

@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
 from tests.export.test_fmu_played import with_effects
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable

@@ -20,8 +20,8 @@ from scipy.optimize import least_squares
 
 import psa_casadi as psa
 from psa_casadi import datasets
+from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.datasets.devices import LEVELS, linear_response
-from psa_casadi.units import ComplexArray, FloatArray
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 
 #: Sampling rate [Hz]; samples that the score leaves out; axes.

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.io import loadmat
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 from tests.any_model import hard_plants as hard
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
 

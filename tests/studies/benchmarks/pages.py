@@ -10,11 +10,11 @@ from matplotlib.figure import Figure
 
 import psa_casadi as psa
 from psa_casadi.export.web import web_module
+from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.report.page.document import render
 from psa_casadi.report.page.live import LiveModel, LiveRecord
 from psa_casadi.report.words import colours
 from psa_casadi.report.words.series import Curve, Series
-from psa_casadi.variables import Interval, Provenance
 from tests.report.browser import DARK, find_browser, without_policy
 from tests.report.report_cases import NOISE
 from tests.studies.benchmarks.table import Outcome, Progress

@@ -12,12 +12,12 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.paper import COEFFICIENTS, find_steps, moment_coefficients
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.phrases import number
-from psa_casadi.units import FloatArray
 from tests.identification.paper_cases import coefficients_of_values
 from tests.studies.benchmarks.records import Values, noisy, slowest
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable

@@ -23,6 +23,7 @@ from scipy.optimize import least_squares
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.records.split import whole
@@ -30,7 +31,6 @@ from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation import device
 from psa_casadi.simulation.side_by_side import threads
 from psa_casadi.simulation.start import start_on
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, least_times
 

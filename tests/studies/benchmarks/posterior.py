@@ -12,10 +12,10 @@ import numpy as np
 from scipy.stats import chi2
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.posterior.chains import chains_of, prior_draws
 from psa_casadi.posterior.task import Task, task_of
 from psa_casadi.simulation.side_by_side import one_thread
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
 

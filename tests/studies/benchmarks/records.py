@@ -17,8 +17,8 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi import reference
+from psa_casadi.common.units import FloatArray
 from psa_casadi.records import multisine, sine, time_grid
-from psa_casadi.units import FloatArray
 from tests.studies.plants.make import Truth, make_record, play_again
 
 Values = Mapping[str, float]

@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.posterior.chains import chains_of, sampler_and_arviz
 from psa_casadi.posterior.task import Task
 from psa_casadi.report.words.phrases import number
 from psa_casadi.simulation.side_by_side import one_thread
-from psa_casadi.units import FloatArray
 from tests.studies.benchmarks.posterior import task_for
 from tests.studies.benchmarks.records import noisy
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable

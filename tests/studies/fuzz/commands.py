@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from random import Random
 
-from psa_casadi.errors import PsaError
+from psa_casadi.common.errors import PsaError
 from psa_casadi.export.importer.fmu_model import load_model
 from tests.studies.fuzz.campaign import (
     CRASH,

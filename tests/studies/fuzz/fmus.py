@@ -18,7 +18,7 @@ import fmpy
 from fmpy.fmi1 import FMICallException
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.errors import InputError, PsaError
+from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.export.fmu.archive import MODEL_ENTRY
 from psa_casadi.model.model_file import dumps, loads
 from tests.export.fmu_models import entries, exported

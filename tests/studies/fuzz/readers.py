@@ -20,16 +20,16 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 import psa_casadi as psa
+from psa_casadi.common.units import convert, parse_unit, si_unit
 from psa_casadi.design.tracking.targets import read_target
 from psa_casadi.export.fmu.description import model_description
 from psa_casadi.export.fmu.evidence import evidence_texts
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.ports import with_ports
+from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns
 from psa_casadi.records.record import COLUMNS
-from psa_casadi.units import convert, parse_unit, si_unit
-from psa_casadi.variables import Interval, Provenance
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
 from tests.export.fmu_models import model_named
 from tests.model.evidence_models import evident_model

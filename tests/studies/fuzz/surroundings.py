@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from psa_casadi.errors import InputError
+from psa_casadi.common.errors import InputError
 from tests.studies.fuzz.campaign import LEFT_OVER, WRONG_EXIT, Draw, Finding, Target
 from tests.studies.fuzz.commands import (
     LIBC,

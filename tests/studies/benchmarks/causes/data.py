@@ -14,7 +14,7 @@ import pandas as pd
 from jinja2 import Template
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 from tests.studies.benchmarks.hidden_cases import (
     NOISES,
     REACHED,

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.units import FloatArray
+from psa_casadi.common.units import FloatArray
 
 FORMAT = "psa_causes.answer/1"
 
