@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 from tests.studies.golden.cases import CASES, Row
-from tests.studies.golden.compare import SECONDS, keep, kept, table, totals, twelfth
+from tests.studies.golden.compare import SECONDS, history, keep, kept, table, totals, twelfth
 
 #: One thread for each case; compiled as users have it, so that times compare.
 _ALONE = {
@@ -55,8 +55,8 @@ def _apart(case: str) -> Row:
     return dict(json.loads(ended.stdout.splitlines()[-1]))
 
 
-def _shown(lines: Iterable[tuple[str, str, str, str]]) -> None:
-    rows = [("case", "what", "before", "now"), *lines]
+def _print(lines: Iterable[tuple[str, ...]], *head: str) -> None:
+    rows = [head or ("case", "what", "before", "now"), *lines]
     widths = [max(len(row[k]) for row in rows) for k in range(3)]
     for row in rows:
         start = "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=False))
@@ -69,11 +69,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--accept", action="store_true", help="keep the answers")
     parser.add_argument("--only", default="", help="pattern of kind/name, as exam/k1 or ^own/")
     parser.add_argument("--twelfth", action="store_true", help="the quick ones, one of twelve")
+    parser.add_argument("--history", action="store_true", help="processor times, by commit")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")
     parser.add_argument("--answer", choices=CASES, metavar="CASE", help="print one answer as JSON")
     inputs = parser.parse_args(arguments)
     if inputs.answer:
         print(json.dumps(answered(inputs.answer)))
+        return 0
+    if inputs.history:
+        _print(history(), "date", "commit", "processor time", "same cases")
         return 0
     before, ids = kept(), [case for case in CASES if re.search(inputs.only, case)]
     if inputs.twelfth:
@@ -89,9 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             keep({case: row})
 
     now = run(ids, inputs.workers, report)
-    _shown(table(before, now))
+    _print(table(before, now))
     print()
-    _shown(totals(before, now))
+    _print(totals(before, now))
     return int(bool(table(before, now, times=False)) and not inputs.accept)
 
 

@@ -2,6 +2,7 @@
 
 import math
 import re
+import subprocess
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -23,13 +24,39 @@ _SURE = re.compile(r" (\d\.\d+)")
 
 def kept() -> dict[str, Row]:
     """Return the kept answers by case."""
+    return rows_of((path.stem, path.read_text("utf-8")) for path in sorted(ANSWERS.glob("*.tsv")))
+
+
+def rows_of(files: Iterable[tuple[str, str]]) -> dict[str, Row]:
+    """Return the answers by case, of files as pairs of kind and text."""
     rows: dict[str, Row] = {}
-    for path in sorted(ANSWERS.glob("*.tsv")):
-        head, *lines = path.read_text("utf-8").splitlines()
+    for kind, text in files:
+        head, *lines = text.splitlines()
         for line in lines:
             row = dict(zip(head.split("\t"), line.split("\t"), strict=True))
-            rows[f"{path.stem}/{row.pop('case')}"] = row
+            rows[f"{kind}/{row.pop('case')}"] = row
     return rows
+
+
+def history() -> list[tuple[str, str, str, str]]:
+    """Return date, commit, processor time and its change over the cases of the commit before."""
+    place = f"./{ANSWERS.relative_to(Path.cwd())}"
+    lines, last = [], dict[str, Row]()
+    for line in _git("log", "--reverse", "--format=%h %as", "--", place).splitlines():
+        commit, date = line.split()
+        names = _git("ls-tree", "--name-only", commit, f"{place}/").split()
+        rows = rows_of((Path(n).stem, _git("show", f"{commit}:./{n}")) for n in names)
+        both = [c for c in rows if c in last]
+        old, new = (sum(float(r[c].get(SECONDS, 0)) for c in both) for r in (last, rows))
+        total = sum(float(row.get(SECONDS, 0)) for row in rows.values())
+        change = f"x{new / old:.2f}" if old else "-"
+        lines.append((date, commit, f"{total:.0f} s, {len(rows)} cases", change))
+        last = rows
+    return lines
+
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], capture_output=True, text=True, check=True).stdout
 
 
 def keep(rows: Mapping[str, Row]) -> None:
