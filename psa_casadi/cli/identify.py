@@ -55,7 +55,7 @@ def identify(
     from psa_casadi.identification.identify import StackIdentification
     from psa_casadi.identification.identify import identify as of_stack
     from psa_casadi.identification.paper import identify_by_paper
-    from psa_casadi.report.words.advice_words import profile_sentences
+    from psa_casadi.report.words.notes import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
     any_model = own_model(inputs, model, fitting)

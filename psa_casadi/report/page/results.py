@@ -21,9 +21,8 @@ from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
 from psa_casadi.report.plots import findings, records
 from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
-from psa_casadi.report.words import fit_words, phrases, tables, text, verdict_words
-from psa_casadi.report.words.advice_words import profile_sentences
-from psa_casadi.report.words.misfit_words import AXES, weight
+from psa_casadi.report.words import notes, phrases, tables, text, verdict_words
+from psa_casadi.report.words.catalogue import TITLES
 from psa_casadi.report.words.phrases import added, lowered, number, plain
 from psa_casadi.report.words.remedy_words import what_now
 from psa_casadi.report.words.series import (
@@ -143,7 +142,7 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
     rows = [(s, residual_figures(s, s.curves[0])) for s in series]
     rows.sort(key=lambda row: -row[1].range_share)
     wrong = [
-        f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
+        f"{s.name}: {notes.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
         for s, f in rows[:_SERIES]
     ]
     errors = []
@@ -173,7 +172,7 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
         "errors": [_bars(d, caption, rms, scale.text, estimated)],
         "answers": [f"{label}: {text}" for label, text in answers if text],
         "wrong": [
-            [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
+            [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -text.weight(m))]
             for misfits in (d.misfit, d.remainder)
         ],
         "views": [p for m, name in drawn(d.misfit) if (p := _data_view(d, m, name)) is not None],
@@ -211,7 +210,7 @@ def fit_page(
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
             span = max(e.record.range_m for e in identification.experiments)
-            error = fit_words.error_sentence(identification.fit.rms, noise, span, scale, origin)
+            error = notes.error_sentence(identification.fit.rms, noise, span, scale, origin)
             largest = max(f.largest for f in figures)
             tiles = [
                 (f"error, {what}", scale.text(v), f"{number(100.0 * v / span, 2)} % of the range")
@@ -228,13 +227,15 @@ def fit_page(
             identification=identification,
             combinations=stack.combinations if stack else (),
             further=stack.advice if stack else (),
-            verdict=f"{error} {fit_words.determined_sentence(graded)}",
+            verdict=f"{error} {notes.determined_sentence(graded)}",
             tiles=tiles,
             live=live,
             determined=_determined(identification, graded),
             profiles=[
                 Picture(
-                    f"Profile of {p.name}", findings.profile_plot(p), " ".join(profile_sentences(p))
+                    f"Profile of {p.name}",
+                    findings.profile_plot(p),
+                    " ".join(notes.profile_sentences(p)),
                 )
                 for p in profiles
             ],
@@ -340,7 +341,7 @@ def _part(
     return {
         "name": s.name,
         "title": s.title,
-        "sentence": fit_words.residual_sentence(figures, s.curves[-1].label, s.time_scale),
+        "sentence": notes.residual_sentence(figures, s.curves[-1].label, s.time_scale),
         "over_time": over_time if timed else None,
         "views": [*(over_it if driver else []), *views],
     }
@@ -412,7 +413,7 @@ def _data_view(d: StackDiagnosis, m: Misfit, name: str) -> Picture | None:
     after = findings.view_named(extended, name) if extended else None
     plot = findings.view_plot(before, after, counts=counts)
     share = f", {phrases.percent(before.share)} of the excess" if before.significant else ""
-    return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
+    return Picture(f"{m.record}: {lowered(TITLES[before.name])}{share}", plot)
 
 
 def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Table | None:
@@ -442,7 +443,7 @@ def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
     view, note = expected.telling.name, size_sentence(expected)
     if view == "holds":
         note += " Counted from the beginning of the hold, in the direction of the last change."
-    caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
+    caption = f"{plain(name).capitalize()}, simulated: {lowered(TITLES[view])}"
     pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
     there = [p for p in pictures if p is not None]
     return {"name": plain(name), "looks_like": effect.looks_like, "pictures": there}
@@ -463,7 +464,7 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
     else:
         strongest = drawn(d.misfit)
         data = _data_view(d, *strongest[0]) if strongest else None
-        axis = AXES[name].title.lower()
+        axis = TITLES[name].lower()
         note = f"No record has {axis} to compare; this is the view that shows most."
     return None if data is None else Picture(data.caption, data.panel, note)
 
@@ -471,10 +472,10 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
 def _determined(identification: Identification, graded: tuple[grades.Grade, ...]) -> list[Picture]:
     if not identification.determinacy.names:
         return []
-    errors, note = findings.determinacy_plot(graded), fit_words.error_bar_note(graded)
+    errors, note = findings.determinacy_plot(graded), notes.error_bar_note(graded)
     pictures = [Picture("Relative standard error of each parameter", errors, note)]
     if len(identification.determinacy.names) > 1:
-        words = fit_words.pairs_sentence(grades.strong_pairs(identification))
+        words = notes.pairs_sentence(grades.strong_pairs(identification))
         plot = findings.correlation_plot(identification)
         pictures.append(Picture("Correlation of the estimates", plot, words))
     return pictures

@@ -30,7 +30,7 @@ from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.catalogue import TITLES
 from psa_casadi.report.words.series import (
     Series,
     most_telling,
@@ -479,7 +479,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     draw(left, added_over_time, "What the effect adds, over time")
     left.margins(x=0.01)
     view = signature.telling
-    title = f"{AXES[view.name].title}: explains {phrases.percent(view.share)} of it"
+    title = f"{TITLES[view.name]}: explains {phrases.percent(view.share)} of it"
     if view.name == "spectrum":
         title = f"Spectrum: {phrases.percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}

@@ -7,6 +7,7 @@ import numpy as np
 from psa_casadi.design.experiment.experiment import CHANCE, PLAYS, Informative, Separated
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import (
     in_display_unit,
     interval_text,
@@ -18,15 +19,6 @@ from psa_casadi.report.words.phrases import (
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.start import is_stack
-
-_FAMILIES = {
-    "free": "free-form, linear between corners",
-    "triangles": "triangles between reversal points",
-    "steps": "steps and holds",
-    "multisine": "multisine",
-    "sine": "sine (no designed input was better)",
-    "triangle": "triangle (no designed input was better)",
-}
 
 
 @dataclass(frozen=True)
@@ -56,7 +48,7 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
             f" {number(rate)}{per_second}{current}"
         )
     inputs = (
-        f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
+        f"{say(f'family.{design.kind}').capitalize()}: {record.n} samples in"
         f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
     )
     return (*promises, inputs)

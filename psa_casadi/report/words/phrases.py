@@ -219,9 +219,10 @@ MOST_NAMES = 5
 
 
 def listing(
-    words: Sequence[str], joint: str = "and", between: str = ",", *, most: int | None = None
+    each: Iterable[str], joint: str = "and", between: str = ",", *, most: int | None = None
 ) -> str:
     """Return "a, b and c", or "a, b and 7 more" of more words than `most`."""
+    words = list(each)
     if most is not None and len(words) > most:
         return f"{', '.join(words[:most])} {joint} {len(words) - most} more"
     if len(words) < 2:

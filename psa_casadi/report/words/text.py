@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.held_out import Errors
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.diagnosis.result import Cause, Diagnosis, OutputError, StackDiagnosis
 from psa_casadi.export.check.rows import OF_BINARIES
@@ -17,7 +19,6 @@ from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import in_parts
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import verdict_words
-from psa_casadi.report.words.misfit_words import strongest
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
@@ -102,6 +103,17 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     firsts = (note.partition(". ") for note in d.notes)
     lines.extend(("note", f"{first}{dot.rstrip()}") for first, dot, _ in firsts)
     return lines
+
+
+def weight(m: Misfit) -> float:
+    """Return the excess over the noise, by which records are compared."""
+    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
+
+
+def strongest(misfits: Sequence[Misfit]) -> Note | None:
+    """Return the finding with the largest excess, None if nothing is above the noise."""
+    above_noise = [m for m in misfits if len(m.findings) > 1]
+    return max(above_noise, key=weight).findings[1] if above_noise else None
 
 
 def _displacement_errors(d: StackDiagnosis) -> list[tuple[str, str]]:
