@@ -121,20 +121,14 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             "comparison.html",
             f"Comparison of {len(findings)} devices",
             findings=findings,
-            verdict=words.difference_sentence(findings, rows),
+            rows=rows,
+            scale=scale,
             tiles=[_tile(f) for f in findings[:_MOST_TILES]],
-            verdicts=words.verdict_table(findings, scale),
             warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
-            budget=any(f.budget for f in findings)
-            and {"panel": plots.budget_plot(findings), "table": words.budget_table(findings)},
-            parameters=rows
-            and {
-                "panel": plots.difference_plot(findings, rows),
-                "table": words.difference_table(findings, rows),
-            },
+            budget=any(f.budget for f in findings) and plots.budget_plot(findings),
+            differences=rows and plots.difference_plot(findings, rows),
             traces=any(f.trace for f in findings) and plots.error_plots(findings),
             scales=len({f.force_scale for f in findings if f.force_scale}),
-            files=words.file_table(findings),
         )
     atomic_write(path, page)
 
@@ -170,11 +164,8 @@ def write_population(
         "Population of devices",
         badges,
         p=p,
-        verdict=" ".join(words.population_sentences(p)),
         tiles=_tiles(p, len(without)),
-        method=words.METHOD,
         **words.population_tables(p),
-        left_out=words.left_out_sentence(p),
         spread_pictures=[
             Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in spreads
         ],

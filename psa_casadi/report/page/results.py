@@ -23,6 +23,7 @@ from psa_casadi.report.plots import findings, records
 from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
 from psa_casadi.report.words import notes, phrases, tables, text, verdict_words
 from psa_casadi.report.words.catalogue import TITLES
+from psa_casadi.report.words.notes import profile_sentences
 from psa_casadi.report.words.phrases import added, lowered, number, plain
 from psa_casadi.report.words.remedy_words import what_now
 from psa_casadi.report.words.series import (
@@ -42,11 +43,6 @@ MOST_RECORDS = 16
 _SIGNATURES, _VIEWS, _TOLD_RECORDS, _TOLD = 3, 3, 4, 6
 #: Of any model: outputs whose errors are drawn, series with a sentence, effects with bars.
 _OUTPUTS, _SERIES, _EFFECTS = 4, 4, 16
-#: What a page shows of a stack, or of some diagnoses alone.
-_OF_STACK = (
-    "stack", "answers", "views", "splits", "signatures", "columns", "gained", "blind", "noise",
-    "moved", "most", "excess", "patch",
-)  # fmt: skip
 #: Views that show nearly the same as another one: of these, and of gain and lag, one is drawn.
 _FAMILIES = {"displacement": "voltage", "from_reversal": "since_reversal"}
 
@@ -71,7 +67,7 @@ def write_report(
     stack = diagnosis if isinstance(diagnosis, StackDiagnosis) else None
     scale = phrases.scale_of(stack.experiments, stack.base_errors.holdout_rms_m) if stack else None
     with phrases.one_unit(scale):
-        atomic_write(path, _page(diagnosis, stack, origin, still, model_file))
+        atomic_write(path, _page(diagnosis, origin, still, model_file))
 
 
 def write_fit_report(
@@ -96,44 +92,25 @@ def write_fit_report(
     atomic_write(path, page)
 
 
-def _page(
-    d: Diagnosis, stack: StackDiagnosis | None, origin: str, still: bool, model_file: str | None
-) -> str:
-    series, effects = series_of(d), {c.name: c for c in d.model.components}
+def _page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
+    series, stack = series_of(d), isinstance(d, StackDiagnosis)
     live = None if still else live_diagnosis(d, series)  # compiles meanwhile
-    gain = tables.error_table(d, series[0].residual_scale)
-    by_record = len(d.experiments) > 1 and not stack
-    parts = _budget(d) | (_of_stack(stack) if stack else _of_any(d, series))
-    about = f" of {plain(d.model.name)}" if not stack else ""
+    most, about = (None, "") if stack else (_EFFECTS, f" of {plain(d.model.name)}")
+    parts = _of_stack(d) if isinstance(d, StackDiagnosis) else _of_any(d, series)
     return render(
         "diagnosis.html",
         f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
         **_shared(d, series, origin),
-        **{**dict.fromkeys(_OF_STACK, ()), **parts},
+        **parts,
         d=d,
-        added=added(d),
-        verdict=verdict_words.verdict_sentence(d),
+        stack=stack,
+        series=series,
         advice=what_now(d, model_file),
+        budget=_budget(d),
         live=live,
+        most=most,
         most_records=_TOLD_RECORDS,
-        evidence=findings.evidence_plot(d, None if stack else _EFFECTS),
-        causes=[
-            {
-                "cause": c,
-                "effect": effects[c.effect],
-                "size": verdict_words.cause_size(d, c),
-                "parameters": tables.parameter_table(d.model, only=c.parameters),
-                "alternatives": [
-                    f"{phrases.raised(verdict_words.alternative_sentence(d, a))}."
-                    for a in (stack.alternatives if stack else ())
-                    if a.cause == c.effect
-                ],
-            }
-            for c in d.causes
-        ],
-        gain=[gain, tables.record_error_table(series)] if by_record else [gain],
-        rest=phrases.rest_sentence(d),
-        candidates=tables.candidate_table(d),
+        evidence=findings.evidence_plot(d, most),
     )
 
 
@@ -150,8 +127,11 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
         caption = f"{e.output}: error on held-out samples, rms"
         in_unit = partial(phrases.with_its_unit, unit=e.unit)
         errors.append(_bars(d, caption, (e.base, e.extended, e.noise), in_unit))
-    wrong = [d.missed.where, *wrong]
-    return {"errors": errors, "wrong": [[wrong], []], "most": _EFFECTS, "moved": d.moved}
+    return {
+        "errors": errors,
+        "wrong": [[[d.missed.where, *wrong]], []],
+        **dict.fromkeys(("views", "splits", "signatures"), ()),
+    }
 
 
 def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
@@ -164,13 +144,8 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     estimated = f" It is estimated from: {sources}." if sources else ""
     caption = f"Error on held-out samples, rms; the displacement's range is {reach}"
     rms = e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m
-    answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
-    gained = verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
-    own_voltages = added(d) and not d.gain.held_out_records
     return {
-        "stack": True,
         "errors": [_bars(d, caption, rms, scale.text, estimated)],
-        "answers": [f"{label}: {text}" for label, text in answers if text],
         "wrong": [
             [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -text.weight(m))]
             for misfits in (d.misfit, d.remainder)
@@ -182,10 +157,6 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
             if (table := split_table(m, *_compared(d, m))) is not None
         ],
         "signatures": [s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
-        "columns": tables.column_table(d) if d.columns else None,
-        "gained": [f"{phrases.raised(gained)}.", *([verdict_words.OWN_VOLTAGES] * own_voltages)],
-        "blind": tables.blind_table(d),
-        "noise": [n.sentence for n in d.noise],
     }
 
 
@@ -206,7 +177,7 @@ def fit_page(
     with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
         graded, tiles = grades.grades(identification), []
-        error = text.fit_sentence(identification) if stack is None else ""
+        error = "" if stack else text.fit_sentence(identification)
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
             span = max(e.record.range_m for e in identification.experiments)
@@ -224,22 +195,13 @@ def fit_page(
             "fit.html",
             f"Identification of {'a stack' if stack else plain(identification.model.name)}",
             **_shared(identification, series, origin),
-            identification=identification,
-            combinations=stack.combinations if stack else (),
-            further=stack.advice if stack else (),
             verdict=f"{error} {notes.determined_sentence(graded)}",
             tiles=tiles,
+            stack=stack,
             live=live,
             determined=_determined(identification, graded),
-            profiles=[
-                Picture(
-                    f"Profile of {p.name}",
-                    findings.profile_plot(p),
-                    " ".join(notes.profile_sentences(p)),
-                )
-                for p in profiles
-            ],
-            starts=tables.starts_table(identification.starts, series[0].residual_scale),
+            profiles=[(p.name, findings.profile_plot(p), profile_sentences(p)) for p in profiles],
+            scale=series[0].residual_scale,
             errors=tables.fit_error_table(series, figures),
         )
 
@@ -249,20 +211,11 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
 
     Raises InputError when `path` cannot be written to.
     """
-    experiments, name = posterior.task.experiments, plain(posterior.model.name)
-    records = phrases.counted(len(experiments), "record")
-    page = render(
-        "posterior.html",
-        f"Posterior of {name}",
-        [records],
-        posterior=posterior,
-        verdict=f"The posterior of {name}, given {records}: {text.drawn(posterior)}.",
-        figure=posterior_figure(posterior),
-        parameters=text.posterior_table(posterior),
-        left=text.left_table(posterior),
-        used=tables.record_table(experiments, "measured"),
-    )
-    atomic_write(path, page)
+    name = plain(posterior.model.name)
+    records = phrases.counted(len(posterior.task.experiments), "record")
+    verdict = f"The posterior of {name}, given {records}: {text.drawn(posterior)}."
+    options = {"posterior": posterior, "verdict": verdict, "figure": posterior_figure(posterior)}
+    atomic_write(path, render("posterior.html", f"Posterior of {name}", [records], **options))
 
 
 def _shared(
@@ -272,37 +225,31 @@ def _shared(
 
     On the page of a fit the former appears only if no script runs.
     """
-    model = result.model
     identification = result if isinstance(result, Identification) else None
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
     worst = most_telling(series)
     limit = points_each(len(series))
     curves = phrases.listing([origin, *(c.label for c in worst.curves)])
-    below = Picture(
-        f"{worst.name}: {curves}",
-        records.time_plot(worst, origin, limit),
-        f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
-    )
     stack = result if isinstance(result, StackIdentification) else None
-    known = grades.determined(model, stack)
-    others = [n for n in model.parameter_names if n not in known]
     return {
         "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
         "origin": origin,
         "worst": worst,
         "still": record_figure(worst, origin=origin),
-        "below": below,
+        "below": Picture(
+            f"{worst.name}: {curves}",
+            records.time_plot(worst, origin, limit),
+            f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
+        ),
         "parts": [
             _part(s, figures[k], origin, limit, identification or s.name != worst.name)
             for k, s in enumerate(series)
             if k in order[:MOST_RECORDS]
         ],
         "count": len(series),
-        "parameters": {
-            name: tables.parameter_table(model, identification, only) if only else None
-            for name, only in (("known", known), ("others", others))
-        },
+        "identification": identification,
+        "known": grades.determined(result.model, stack),
         "used": tables.record_table(result.experiments, origin),
     }
 
@@ -358,21 +305,19 @@ def _bars(
     return {"caption": caption, "rows": rows, "noise": errors[-1], "note": note}
 
 
-def _budget(d: Diagnosis) -> dict[str, Any]:
-    """Return the error budget, and what the unnamed correction adds."""
+def _budget(d: Diagnosis) -> tuple[str | None, Picture | None] | None:
+    """Return the excess of a stack, and what the unnamed correction adds; None without either."""
     b, excess, patch = d.budget, None, None
     if isinstance(b, StackBudget):
         if b.excess_rms_m <= 0.0:
-            return {"budget": None}
+            return None
         excess = phrases.scale_of(d.experiments, b.excess_rms_m).text(b.excess_rms_m)
     elif not added(d) and d.patch is None:
-        return {"budget": None}
+        return None
     if d.patch is not None:
         coordinate, plot = findings.correction_plot(d, d.patch)
-        caption = f"Unnamed correction: {d.patch.name}, over {coordinate}"
-        patch = {"text": verdict_words.patch_text(d.patch), "picture": Picture(caption, plot)}
-    rest = {"patch": patch, "families": d.families}
-    return {"budget": verdict_words.budget_table(d), "excess": excess, **rest}
+        patch = Picture(f"Unnamed correction: {d.patch.name}, over {coordinate}", plot)
+    return excess, patch
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
