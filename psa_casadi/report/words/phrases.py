@@ -69,10 +69,7 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
     """Return the unit in which a length of size `largest` [m] is a handy number."""
     if counts:
         return Scale("counts", 1.0)
-    for unit, size in (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9)):
-        if largest >= 0.5 * size:
-            return Scale("µm" if unit == "um" else unit, 1.0 / size)
-    return Scale("nm", 1e9)
+    return prefixed_scale(min(max(1e-9, largest), 0.1), "m")  # never in metres
 
 
 def prefixed_scale(largest: float, unit: str) -> Scale:

@@ -19,6 +19,7 @@ from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import in_parts
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import verdict_words
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
@@ -202,18 +203,10 @@ def effect_page(
 
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
-    against = "" if report.compared else " There was no model to compare it with."
-    if report.foreign:
-        against = " It was checked by the standard; a note is no violation."
     unseen = [name for name in report.left_out if name in OF_BINARIES]
-    if fixed := [name for name in report.left_out if name not in OF_BINARIES]:
-        against += f" Left out, as its step is fixed: {listing(fixed)}."
-    if unseen:
-        against += f" Left out, as lief is not installed (`pip install lief`): {listing(unseen)}."
-    if report.passed:
-        return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
-    failed = listing([r.name for r in report.failures])
-    return f"{Path(report.path).name} did not pass: {failed}.{against}"
+    fixed = [name for name in report.left_out if name not in OF_BINARIES]
+    name = Path(report.path).name
+    return say("check.ended", report=report, name=name, fixed=fixed, unseen=unseen)
 
 
 def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
