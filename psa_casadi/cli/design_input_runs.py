@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import kept
+from psa_casadi.cli.failures import Outputs
 from psa_casadi.cli.screen import show_results, show_written, working
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking import targets
@@ -135,8 +135,8 @@ def _keeping(task: Task, response: targets.Response) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         _write(task, response)
-        output = kept("the voltage was designed before", [task.output], [task.report])
-        raise KeyboardInterrupt(output) from None
+        files = Outputs({"--output": task.output, "--report": task.report}, [task.output])
+        raise files.cut_off("the voltage was designed before") from None
 
 
 def _write(task: Task, response: targets.Response) -> None:

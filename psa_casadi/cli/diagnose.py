@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
+from psa_casadi.cli.failures import Outputs, judge
 from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
 from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
@@ -122,7 +122,7 @@ def diagnose(
             try:
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
-                raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
+                raise files.unfinished(stop, Outputs(outputs)) from None
             place = next_ or next_voltage(json or report)
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
@@ -185,18 +185,17 @@ def _finish(
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
-    written: list[Path] = []
-    origin, still = page
+    written, (origin, still) = Outputs(outputs), page
     try:
         with stage("next experiment"):
             d = files.with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written, still=still)
+            files.write(d, written, origin, still=still)
         with stage("unnamed correction"):
             return d, files.write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
+        raise files.finished(d, written) from None
 
 
 def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None:

@@ -34,8 +34,12 @@ _HOME = "psa_casadi.report.page"
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
-#: The modules of words whose functions templates call.
-_IN_TEMPLATES = ("phrases", "population_words", "tables", "text", "verdict_words")
+#: The modules whose functions templates call.
+_IN_TEMPLATES = (
+    "plots.figures", "plots.findings", "plots.records", "words.catalogue", "words.notes",
+    "words.phrases", "words.population_words", "words.tables", "words.text",
+    "words.verdict_words",
+)  # fmt: skip
 #: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
 _LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
@@ -133,7 +137,8 @@ def environment() -> Environment:
         trim_blocks=True, lstrip_blocks=True, finalize=_words,
     )  # fmt: skip
     made.globals.update(column_styles=_column_styles, still_picture=_still_picture)
-    made.globals |= {n: import_module(f"psa_casadi.report.words.{n}") for n in _IN_TEMPLATES}
+    for place in _IN_TEMPLATES:
+        made.globals[place.partition(".")[2]] = import_module(f"psa_casadi.report.{place}")
     made.filters.update(plain=phrases.plain, percent=phrases.percent, either=phrases.either)
     return made
 

@@ -1,7 +1,7 @@
 """Pages of diagnoses and identifications: what their templates show, the story first."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,23 +11,22 @@ from psa_casadi.common.files import atomic_write
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.diagnosis.signature import signature
+from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.identification import grades
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.component import Component
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
-from psa_casadi.report.plots import findings, records
-from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
+from psa_casadi.report.plots import findings
+from psa_casadi.report.plots.figures import posterior_figure, record_figure
 from psa_casadi.report.words import notes, phrases, tables, text, verdict_words
 from psa_casadi.report.words.catalogue import TITLES
-from psa_casadi.report.words.notes import profile_sentences
 from psa_casadi.report.words.phrases import added, lowered, number, plain
 from psa_casadi.report.words.remedy_words import what_now
 from psa_casadi.report.words.series import (
-    ResidualFigures,
     Series,
     most_telling,
     residual_figures,
@@ -122,13 +121,14 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
         f"{s.name}: {notes.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
         for s, f in rows[:_SERIES]
     ]
-    errors = []
-    for e in d.errors[:_OUTPUTS]:
-        caption = f"{e.output}: error on held-out samples, rms"
-        in_unit = partial(phrases.with_its_unit, unit=e.unit)
-        errors.append(_bars(d, caption, (e.base, e.extended, e.noise), in_unit))
+    captions = [f"{e.output}: error on held-out samples, rms" for e in d.errors]
+    errors = [
+        (caption, (e.base, e.extended, e.noise), partial(phrases.with_its_unit, unit=e.unit))
+        for caption, e in zip(captions[:_OUTPUTS], d.errors, strict=False)
+    ]
     return {
         "errors": errors,
+        "noise_from": "",
         "wrong": [[[d.missed.where, *wrong]], []],
         **dict.fromkeys(("views", "splits", "signatures"), ()),
     }
@@ -137,15 +137,14 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
 def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     """Return what the page shows of a stack alone."""
     span = max(e.record.range_m for e in d.experiments)
-    e, x = d.base_errors, d.extended_errors
-    scale = phrases.scale_of(d.experiments, e.holdout_rms_m)
+    scale = phrases.scale_of(d.experiments, d.base_errors.holdout_rms_m)
     reach = phrases.handy_scale(span, counts=scale.unit == "counts").text(span)
-    sources = phrases.listing(list(dict.fromkeys(n.source for n in d.noise)))
-    estimated = f" It is estimated from: {sources}." if sources else ""
+    sources = phrases.listing(dict.fromkeys(n.source for n in d.noise))
     caption = f"Error on held-out samples, rms; the displacement's range is {reach}"
-    rms = e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m
+    rms = d.base_errors.holdout_rms_m, d.extended_errors.holdout_rms_m, d.noise_floor_rms_m
     return {
-        "errors": [_bars(d, caption, rms, scale.text, estimated)],
+        "errors": [(caption, rms, scale.text)],
+        "noise_from": f" It is estimated from: {sources}." if sources else "",
         "wrong": [
             [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -text.weight(m))]
             for misfits in (d.misfit, d.remainder)
@@ -199,8 +198,9 @@ def fit_page(
             tiles=tiles,
             stack=stack,
             live=live,
-            determined=_determined(identification, graded),
-            profiles=[(p.name, findings.profile_plot(p), profile_sentences(p)) for p in profiles],
+            graded=graded,
+            grades=grades,
+            profiles=profiles,
             scale=series[0].residual_scale,
             errors=tables.fit_error_table(series, figures),
         )
@@ -229,21 +229,15 @@ def _shared(
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
     worst = most_telling(series)
-    limit = points_each(len(series))
-    curves = phrases.listing([origin, *(c.label for c in worst.curves)])
     stack = result if isinstance(result, StackIdentification) else None
     return {
         "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
         "origin": origin,
         "worst": worst,
+        "limit": points_each(len(series)),
         "still": record_figure(worst, origin=origin),
-        "below": Picture(
-            f"{worst.name}: {curves}",
-            records.time_plot(worst, origin, limit),
-            f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
-        ),
         "parts": [
-            _part(s, figures[k], origin, limit, identification or s.name != worst.name)
+            (s, figures[k], identification is not None or s.name != worst.name)
             for k, s in enumerate(series)
             if k in order[:MOST_RECORDS]
         ],
@@ -257,52 +251,6 @@ def _shared(
 def points_each(count: int) -> int:
     """Return how many samples of each record may be drawn, so that the page stays below 3 MB."""
     return _MOST_SAMPLES // min(MOST_RECORDS, max(1, count))
-
-
-def _shaded(s: Series) -> str:
-    return " Shaded: held out." if s.held_out.any() else ""
-
-
-def _part(
-    s: Series, figures: ResidualFigures, origin: str, limit: int, timed: Any
-) -> dict[str, Any]:
-    """Return the views of a record and its residual; over time only if it is `timed`."""
-    noise = "Dashed: two standard deviations of the noise."
-    driver = s.against.partition(" [")[0]
-    indices = records.samples(s, limit)
-    over_it = [
-        Picture(f"Loop: {s.quantity} over {driver}", records.loop_plot(s, origin, indices)),
-        Picture(f"Residual over {driver}", records.error_loop_plot(s, limit), noise),
-    ]
-    views = [
-        Picture("Where the difference is easiest to see", records.zoom_plot(s, origin, limit)),
-        Picture("Spectrum of the residual", records.spectrum_plot(s, limit),
-                "Dashed: white noise of the record's noise level."),
-        Picture("Autocorrelation of the residual", records.autocorrelation_plot(s),
-                "Dashed: 95 % of the lags of white noise lie between these lines."),
-        Picture("Distribution of the residual", records.distribution_plot(s),
-                "Dashed: normal distribution of the same mean and standard deviation."),
-    ]  # fmt: skip
-    caption = f"{s.title}, and residual: {origin} minus model"
-    over_time = Picture(caption, records.time_plot(s, origin, limit), f"{noise}{_shaded(s)}")
-    return {
-        "name": s.name,
-        "title": s.title,
-        "sentence": notes.residual_sentence(figures, s.curves[-1].label, s.time_scale),
-        "over_time": over_time if timed else None,
-        "views": [*(over_it if driver else []), *views],
-    }
-
-
-def _bars(
-    d: Diagnosis, caption: str, errors: tuple[float, float, float],
-    text: Callable[[float], str], note: str = "",
-) -> dict[str, Any]:  # fmt: skip
-    """Return held-out errors as bars over the noise, which no model can go below."""
-    names = (("base model", "--base"), ("extended model", "--extended"), ("noise", "--noise"))
-    rows = [(name, e, colour, text(e)) for (name, colour), e in zip(names, errors, strict=True)]
-    rows = rows if added(d) else [rows[0], rows[2]]
-    return {"caption": caption, "rows": rows, "noise": errors[-1], "note": note}
 
 
 def _budget(d: Diagnosis) -> tuple[str | None, Picture | None] | None:
@@ -379,19 +327,13 @@ def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Ta
     return tables.Table(tuple(head), tuple(rows))
 
 
-def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
+def _signature(d: StackDiagnosis, name: str) -> tuple[Component, Signature, Any] | None:
     """Return the signature of a cause with the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None
     expected = signature(effect)
-    view, note = expected.telling.name, size_sentence(expected)
-    if view == "holds":
-        note += " Counted from the beginning of the hold, in the direction of the last change."
-    caption = f"{plain(name).capitalize()}, simulated: {lowered(TITLES[view])}"
-    pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
-    there = [p for p in pictures if p is not None]
-    return {"name": plain(name), "looks_like": effect.looks_like, "pictures": there}
+    return effect, expected, _of_the_data(d, expected.telling.name)
 
 
 def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
@@ -412,15 +354,3 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
         axis = TITLES[name].lower()
         note = f"No record has {axis} to compare; this is the view that shows most."
     return None if data is None else Picture(data.caption, data.panel, note)
-
-
-def _determined(identification: Identification, graded: tuple[grades.Grade, ...]) -> list[Picture]:
-    if not identification.determinacy.names:
-        return []
-    errors, note = findings.determinacy_plot(graded), notes.error_bar_note(graded)
-    pictures = [Picture("Relative standard error of each parameter", errors, note)]
-    if len(identification.determinacy.names) > 1:
-        words = notes.pairs_sentence(grades.strong_pairs(identification))
-        plot = findings.correlation_plot(identification)
-        pictures.append(Picture("Correlation of the estimates", plot, words))
-    return pictures
