@@ -57,11 +57,7 @@ def track(task: Task, path: targets.Target, minimax: bool) -> None:
         ("inversion without limits, full simulator", result.inverse.error),
         ("uncompensated, full simulator", targets.error_of(path, plain)),
     ]
-    summary = [
-        say("voltage.follows", e=result.error),
-        *targets.binding(result.response, task.limits),
-        *how,
-    ]
+    summary = [*_follows(task, result.error, result.response), *how]
     badge = "least largest error" if minimax else "least squares"
     pictures = designs.tracking_pictures(result, plain)
     _finish(task, "Designed input", summary, rows, pictures, result.response, path, badge)
@@ -74,12 +70,13 @@ def invert(task: Task, path: targets.Target) -> None:
         rows: _Rows = [("inversion, full simulator", result.error)]
         for reached in _on_fmu(task, result.response, progress):
             rows.append(("inversion, exported FMU", targets.error_of(path, reached)))
-    summary = [
-        say("voltage.follows", e=result.error),
-        *targets.binding(result.response, task.limits),
-    ]
+    summary = _follows(task, result.error, result.response)
     summary.append(say("voltage.trials", count=len(result.trials)))
-    pictures = designs.inversion_pictures(result, task.limits)
+    curve = "inverted, simulated", result.response.displacement
+    pictures = [
+        designs.path_picture("Path and response", result.target, curve),
+        designs.voltage_picture(result.response, task.limits),
+    ]
     _finish(task, "Inverted input", summary, rows, pictures, result.response, path, "inversion")
 
 
@@ -90,7 +87,11 @@ def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     change = float(np.max(np.abs(result.response.voltage - result.played)))
     summary = [say("voltage.trial", e=result.error), say("voltage.change", change=change)]
     summary += targets.binding(result.response, task.limits)
-    rows, pictures = [("the trial, measured", result.error)], designs.trial_pictures(result)
+    rows = [("the trial, measured", result.error)]
+    pictures = [
+        designs.path_picture("Path and trial", result.target, ("trial, measured", result.measured)),
+        designs.voltage_picture(result.response, task.limits, result.played),
+    ]
     _finish(task, "Corrected input", summary, rows, pictures, result.response, path, "one trial")
 
 

@@ -11,9 +11,8 @@ import typer
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import Outputs, judge
-from psa_casadi.cli.inputs import Inputs, meant
+from psa_casadi.cli.inputs import Fitting, Inputs, meant, own_diagnosis, own_model
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
-from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
 from psa_casadi.cli.screen import (
     DIAGNOSE,
     events_to,

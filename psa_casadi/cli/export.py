@@ -11,9 +11,8 @@ from typing import Annotated, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs, step_seconds
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_write, make_folder

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import psa_casadi as psa
 from psa_casadi.cli.failures import Outputs
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import IDENTIFY, print_message, show, show_written, width, working
 from psa_casadi.common.files import atomic_write
 

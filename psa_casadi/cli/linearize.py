@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written
 
 

@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, width, working
 from psa_casadi.common.files import atomic_write
 

@@ -7,9 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Reading, StackName, Start
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, working
 from psa_casadi.common.display import with_units
 from psa_casadi.common.errors import Problems

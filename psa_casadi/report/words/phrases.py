@@ -232,11 +232,6 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def are(names: Sequence[str], between: str = ", ") -> str:
-    """Return names with "is" or "are" behind them."""
-    return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
-
-
 def either(effects: Sequence[str]) -> str:
     """Return effects of which the data leave open which it is, as words."""
     return listing([plain(name) for name in effects], "or", most=MOST_NAMES)
