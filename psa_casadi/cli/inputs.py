@@ -428,27 +428,3 @@ def _made(file: Path, name: str) -> psa.Model:
             lacks = f"say which function of {file} returns the model{known}"
         raise InputError(f"--model: {lacks}, as {file}:{functions[-1] if functions else 'make'}.")
     return model
-
-
-def own_diagnosis(
-    model: psa.Model,
-    records: Sequence[Path],
-    held_out: Sequence[Path],
-    fitting: Fitting,
-    reading: Reading,
-    inputs: Inputs,
-    *,
-    leave_out: Sequence[str],
-    others: Mapping[str, object],
-) -> Callable[..., psa.Diagnosis]:
-    """Read the records of a model that is no stack; return a function that diagnoses it.
-
-    It takes `progress` and `watch`; `others` are options that must be empty.
-    """
-    components = inputs.effects_of_any_model()
-    inputs.refuse(others)
-    measured, held = (inputs.signals(model, part, reading) for part in (records, held_out))
-    return partial(
-        psa.diagnose, model, measured, holdout=held, leave_out=leave_out, effects=components,
-        **fitting.words,
-    )  # fmt: skip
