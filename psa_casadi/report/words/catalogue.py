@@ -108,7 +108,9 @@ CATALOGUE = Environment(
 )  # fmt: skip
 CATALOGUE.globals["infinity"] = math.inf
 CATALOGUE.filters |= {
+    "confidence": phrases.confidence_text,
     "correlation": lambda value: f"{value:.2f}".replace("-", "−"),
+    "either": phrases.either,
     "estimate": _estimate,
     "fmt": format,
     "frequencies": _frequencies,
@@ -129,5 +131,6 @@ CATALOGUE.filters |= {
     "times": _times,
     "with_its_unit": _of_quantity(phrases.with_its_unit),
     "with_unit": phrases.with_unit,
+    "within": phrases.within,
     "word": _word,
 }

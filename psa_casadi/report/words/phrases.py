@@ -161,6 +161,11 @@ def lowered(text: str) -> str:
     return f"{text[:1].lower()}{text[1:]}"
 
 
+def within(share: float) -> float:
+    """Return a share cut to 0 and 1."""
+    return max(0.0, min(1.0, share))
+
+
 def probability_text(probability: float) -> str:
     """Return a probability as a percentage that is neither 0 nor 100."""
     if probability < 0.005:

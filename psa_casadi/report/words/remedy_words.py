@@ -31,8 +31,8 @@ from psa_casadi.report.words.phrases import (
     scale_of,
     with_its_unit,
     with_unit,
+    within,
 )
-from psa_casadi.report.words.verdict_words import within
 
 #: What can be done by the codes of remedies, and the record that shows an effect by its test.
 DO: Mapping[str, str] = TABLES["remedy"]

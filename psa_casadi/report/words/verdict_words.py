@@ -97,29 +97,14 @@ def _base_errors(d: Diagnosis) -> str:
     return say("verdict.base_errors", each=each, ends=ends, outputs=list(shares), most=_NAMED)
 
 
-def within(share: float) -> float:
-    """Return a share cut to 0 and 1."""
-    return max(0.0, min(1.0, share))
-
-
 def _without_name(d: Diagnosis) -> str:
     """Say what an extended model without a cause holds and would take, "" where nothing."""
-    b, together, unnamed = d.budget, "", ""
-    if d.kept:
-        together = phrases.percent(within(b.together.share))
-    if d.patch is not None and b.unnamed is not None:
-        unnamed = phrases.percent(within(b.unnamed.share))
-    kept, more = [phrases.plain(name) for name in d.kept], phrases.added(d)
-    values = {"kept": kept, "together": together, "unnamed": unnamed, "more": more}
-    return say("verdict.without_name", d=d, **values)
+    return say("verdict.without_name", d=d, added=phrases.added(d))
 
 
 def named_cause(cause: Cause) -> str:
     """Name a cause with its place, its confidence, and its indistinguishable rivals."""
-    sure = f"{phrases.place_of(cause)}, {phrases.confidence_text(cause.confidence)}"
-    if cause.cannot_be_told_from:
-        sure += f"; or {phrases.either(cause.cannot_be_told_from)}"
-    return f"{phrases.plain(cause.effect)} ({sure})"
+    return say("verdict.named_cause", cause=cause)
 
 
 #: Least probability from which on a sentence mentions what was not tried.
@@ -153,9 +138,7 @@ def column_sentence(d: StackDiagnosis, c: Decision) -> str:
     """Say what a further column decided, and what the models miss of it in held-out samples."""
     if c.base_rms is None or c.noise is None or c.extended_rms is None:
         return c.sentence
-    after = f", extended {phrases.number(c.extended_rms)}" if phrases.added(d) else ""
-    errors = f"base {phrases.number(c.base_rms)}{after}, noise {phrases.number(c.noise)}"
-    return f"{c.sentence} Held-out rms: {phrases.with_unit(errors, c.unit)}."
+    return say("verdict.column", c=c, added=phrases.added(d))
 
 
 def cause_size(d: Diagnosis, cause: Cause) -> str:
@@ -183,31 +166,17 @@ def cause_size(d: Diagnosis, cause: Cause) -> str:
 
 def patch_text(patch: Correction) -> str:
     """Say what the unnamed correction is, and what else it may be."""
-    others = phrases.listing(patch.open_to, "or")
-    rest = f"; these data cannot distinguish it from {others}" if others else ""
-    where = f", at the {patch.port}" if isinstance(patch, Patch) else ""
-    return f"{patch.sentence}{where}{rest}"
+    port = patch.port if isinstance(patch, Patch) else ""
+    return say("verdict.patch", patch=patch, port=port)
 
 
 def budget_sentence(d: Diagnosis) -> str:
     """Say where the held-out error above the noise goes."""
-    b, parts = d.budget, ["of the held-out error above the noise"]
-    stack = b if isinstance(b, StackBudget) else None
-    scale = phrases.scale_of(d.experiments, d.errors[0].base)
-    if stack:
-        parts = [f"of {scale.text(stack.excess_rms_m)} rms above the noise"]
-    if phrases.added(d):
-        parts.append(_removed(b))
-    if b.unnamed is not None and d.patch is not None:
-        more = "a further" if phrases.added(d) else "of it"
-        parts.append(
-            f"an unnamed correction would remove {more} {b.unnamed.text}: {patch_text(d.patch)}"
-        )
-    if phrases.added(d) and stack:
-        share = phrases.number(stack.remains_percent, 2)
-        left = f"{scale.text(stack.remains_rms_m)} ({share} % of the range)"
-        parts.append(f"above the noise the extended model leaves {left}")
-    return "; ".join(parts)
+    stack = d.budget if isinstance(d.budget, StackBudget) else None
+    scale, added = phrases.scale_of(d.experiments, d.errors[0].base), phrases.added(d)
+    removed, patch = _removed(d.budget) if added else "", d.patch and patch_text(d.patch)
+    values = {"stack": stack, "scale": scale, "removed": removed, "patch": patch}
+    return say("verdict.budget", b=d.budget, added=added, **values)
 
 
 def _removed(b: Budget) -> str:
