@@ -42,7 +42,7 @@ from psa_casadi.devices.jobs import (
     key_of,
 )
 from psa_casadi.documents.files import DEVICE_FORMAT as FORMAT
-from psa_casadi.documents.files import DeviceFile, DeviceRecord, damage, hash_of
+from psa_casadi.documents.files import DeviceFile, RecordUsed, damage, hash_of
 from psa_casadi.documents.findings import DEVICE_FILE, device_finding, finding_content
 from psa_casadi.model.component import Component
 from psa_casadi.model.own_effects import own_effects
@@ -108,7 +108,7 @@ class Results:
             round(outcome.seconds, 3),
             key,
             __version__,
-            tuple(DeviceRecord(name, sha) for name, sha in outcome.records),
+            tuple(RecordUsed(name, sha) for name, sha in outcome.records),
             tuple(name for name, _ in outcome.files),
             tuple(hash_of(text.encode()) for _, text in outcome.files),
         )

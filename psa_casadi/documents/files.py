@@ -87,8 +87,8 @@ Status = Literal["done", "refused", "failed"]
 
 
 @dataclass(frozen=True)
-class DeviceRecord:
-    """A record of the device, with the SHA-256 of its file."""
+class RecordUsed:
+    """A record that was used, with the SHA-256 of its file."""
 
     name: str
     sha256: str
@@ -112,7 +112,7 @@ class DeviceFile:
     seconds: float
     key: str
     package_version: str
-    records: tuple[DeviceRecord, ...]
+    records: tuple[RecordUsed, ...]
     files: tuple[str, ...]
     sha256: tuple[str, ...] = ()
 
@@ -254,14 +254,6 @@ class RecordMisfit:
     excess: float
     views: Mapping[str, float]
     sentences: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class RecordUsed:
-    """A record that was diagnosed, with the SHA-256 of its file."""
-
-    name: str
-    sha256: str
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import any_scale, in_brackets, number, plain
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
@@ -175,11 +176,7 @@ def _responses(
     for (rival, y), colour in zip(deviations.items(), _COLOURS * len(deviations), strict=False):
         plot.line(record.time, scale.factor * y, plain(rival), colour)
     caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
-    note = (
-        "Each rival's prediction less the mean of all, before it is fitted again; the design"
-        " maximises what such a fit leaves."
-    )
-    return Picture(caption, plot, note if several else "")
+    return Picture(caption, plot, say("design.rivals_part") if several else "")
 
 
 # Mechanisms
@@ -204,12 +201,6 @@ def write_mechanism_page(
             live = live_design(whole, (time, voltage, played.displacement), rest=True)
         except InputError as error:
             why = [f"The model does not run in this page. {error}"]
-    acts = (
-        "A mechanism acts as feedback around the mechanics (position, velocity and acceleration"
-        " by its stiffness, damping and mass); the lag stands before the loop."
-    )
-    locus = "The poles as the whole mechanism grows; those beyond the picture are in the table."
-    linear = "Linear answer in closed form, with the lag and the amplifier, without hysteresis."
     write_design_page(
         path,
         title=f"Prestress mechanism for {model.name}",
@@ -217,11 +208,11 @@ def write_mechanism_page(
         live=live,
         tables=(
             design_words.Titled("Mechanism", design_words.mechanism_table(d)),
-            design_words.Titled("Poles", design_words.pole_table(d), acts),
+            design_words.Titled("Poles", design_words.pole_table(d), say("design.acts")),
         ),
         figures=(
-            Picture("Root locus", _root_locus(d), locus),
-            Picture("Step of the rated voltage", _step(d), linear),
+            Picture("Root locus", _root_locus(d), say("design.locus")),
+            Picture("Step of the rated voltage", _step(d), say("design.linear")),
         ),
     )
 

@@ -78,12 +78,8 @@ def design_tables(design: Separated | Informative) -> tuple[Titled, ...]:
     ]
     head = ("if it is", "over", "designed [ln]", *(f"{n} [ln]" for n in usual))
     named = ("if it is", "named after designed", *(f"after {u}" for u in usual))
-    note = (
-        "Each other effect is fitted again, as far as the data at hand let it; the true one is"
-        " taken a standard error weaker than it was fitted."
-    )
     return (
-        Titled("Growth of ln of the Bayes factor", Table(head, tuple(pairs)), note),
+        Titled("Growth of ln of the Bayes factor", Table(head, tuple(pairs)), say("design.pairs")),
         Titled("Probability of being named", Table(named, tuple(chances))),
     )
 
