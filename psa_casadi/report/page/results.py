@@ -175,33 +175,27 @@ def fit_page(
     stack = identification if isinstance(identification, StackIdentification) else None
     with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
-        graded, tiles = grades.grades(identification), []
-        error = "" if stack else text.fit_sentence(identification)
+        graded, sizes = grades.grades(identification), dict[str, Any]()
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
             span = max(e.record.range_m for e in identification.experiments)
             error = notes.error_sentence(identification.fit.rms, noise, span, scale, origin)
-            largest = max(f.largest for f in figures)
-            tiles = [
-                (f"error, {what}", scale.text(v), f"{number(100.0 * v / span, 2)} % of the range")
-                for what, v in (("rms", identification.fit.rms), ("largest", largest))
-            ]
-            tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
-        if fitted := sum(g.degree != "fixed" for g in graded):
-            count = f"{len(grades.named(graded, 'determined'))} of {fitted}"
-            tiles.append(("parameters determined", count, "to 10 % or better"))
+            sizes = {"noise": noise, "span": span, "largest": max(f.largest for f in figures)}
+        else:
+            error = text.fit_sentence(identification)
         return render(
             "fit.html",
             f"Identification of {'a stack' if stack else plain(identification.model.name)}",
             **_shared(identification, series, origin),
+            **sizes,
             verdict=f"{error} {notes.determined_sentence(graded)}",
-            tiles=tiles,
             stack=stack,
             live=live,
+            scale=scale,
             graded=graded,
             grades=grades,
             profiles=profiles,
-            scale=series[0].residual_scale,
+            first_scale=series[0].residual_scale,
             errors=tables.fit_error_table(series, figures),
         )
 
