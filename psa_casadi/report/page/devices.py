@@ -14,8 +14,7 @@ from psa_casadi.documents.findings import Result, read_findings
 from psa_casadi.model.component import Component
 from psa_casadi.population.finding import Finding
 from psa_casadi.population.population import Difference, Population, differences
-from psa_casadi.report.page.document import Picture, render
-from psa_casadi.report.plots import device_plots as plots
+from psa_casadi.report.page.document import render
 from psa_casadi.report.words import population_words as words
 from psa_casadi.report.words.phrases import one_unit
 from psa_casadi.report.words.tables import Table
@@ -121,9 +120,6 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             rows=rows,
             scale=scale,
             warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
-            budget=any(f.budget for f in findings) and plots.budget_plot(findings),
-            differences=rows and plots.difference_plot(findings, rows),
-            traces=any(f.trace for f in findings) and plots.error_plots(findings),
             scales=len({f.force_scale for f in findings if f.force_scale}),
         )
     atomic_write(path, page)
@@ -152,14 +148,7 @@ def write_population(
         badges,
         p=p,
         **words.population_tables(p),
-        spread_pictures=[
-            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in spreads
-        ],
-        drift_pictures=[
-            Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))
-            for s in p.spreads
-            if s.estimates.name in p.drifting
-        ],
+        spreads_drawn=spreads,
         without=Table(("device", "ended", "why"), tuple(without)) if without else None,
     )
     atomic_write(path, page)

@@ -36,8 +36,8 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
 #: The modules whose functions templates call.
 _IN_TEMPLATES = (
-    "plots.figures", "plots.findings", "plots.records", "words.catalogue", "words.notes",
-    "words.phrases", "words.population_words", "words.tables", "words.text",
+    "plots.device_plots", "plots.figures", "plots.findings", "plots.records", "words.catalogue",
+    "words.notes", "words.phrases", "words.population_words", "words.tables", "words.text",
     "words.verdict_words",
 )  # fmt: skip
 #: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
