@@ -107,30 +107,26 @@ CATALOGUE = Environment(
     finalize=_inserted, autoescape=False, keep_trailing_newline=True,
 )  # fmt: skip
 CATALOGUE.globals["infinity"] = math.inf
+_OF_PHRASES = (
+    "confidence_text", "either", "listing", "number", "percent", "plain", "raised", "with_unit",
+    "within",
+)  # fmt: skip
+CATALOGUE.filters |= {name: getattr(phrases, name) for name in _OF_PHRASES}
 CATALOGUE.filters |= {
-    "confidence": phrases.confidence_text,
     "correlation": lambda value: f"{value:.2f}".replace("-", "−"),
-    "either": phrases.either,
     "estimate": _estimate,
     "fmt": format,
     "frequencies": _frequencies,
     "instants": _instants,
-    "listing": listing,
-    "number": phrases.number,
-    "percent": phrases.percent,
-    "plain": phrases.plain,
     "plural": plural,
     "probable": _probable,
     "quantity": _of_quantity(phrases.quantity),
     "quoted": quoted,
-    "raised": phrases.raised,
     "reading": _reading,
     "relative": _relative,
     "si": si,
     "signed": _of_quantity(phrases.signed),
     "times": _times,
     "with_its_unit": _of_quantity(phrases.with_its_unit),
-    "with_unit": phrases.with_unit,
-    "within": phrases.within,
     "word": _word,
 }

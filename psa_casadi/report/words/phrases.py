@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 from psa_casadi.common.units import convert
-from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -185,24 +185,6 @@ def confidence_text(confidence: float) -> str:
     rounded = round(confidence, 2)
     words = next((w for least, w in _LIKELIHOOD if rounded >= least), "unlikely")
     return f"confidence {percent(confidence)}: {words}"
-
-
-def share_text(candidate: Candidate, d: Diagnosis) -> str:
-    """Return the share of the excess that an effect explains alone, or that it was only screened.
-
-    Of one of several named causes also what it removes together with the others.
-    """
-    if not candidate.fitted and candidate.explained_share == 0:
-        alone = "screened"
-    elif candidate.explained_share < 0:
-        alone = "fits worse"
-    else:
-        screened = "" if candidate.fitted else " (screened)"
-        alone = f"{percent(candidate.explained_share)}{screened}"
-    if len(d.causes) < 2 or candidate.effect not in {c.effect for c in d.causes}:
-        return alone
-    share = next((c for c in d.budget.causes if c.what == candidate.effect), None)
-    return alone if share is None else f"{alone}; with others {share.percents[0]} %"
 
 
 def rest_sentence(d: Diagnosis) -> str:
