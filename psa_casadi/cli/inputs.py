@@ -8,7 +8,8 @@ import os
 import re
 import runpy
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -134,13 +135,23 @@ class Inputs:
 
     def numbers(self, option: str, texts: Sequence[str] | None) -> dict[str, float]:
         """Return the numbers of an option NAME=VALUE that may be repeated."""
-        values: dict[str, float] = {}
+        form = f"NAME=VALUE, such as {option} mass=0.3"
+        return {name: value for name, (value,) in self.named(option, texts, form).items()}
+
+    def named(
+        self, option: str, texts: Sequence[str] | None, form: str, counts: Container[int] = (1,)
+    ) -> dict[str, tuple[float, ...]]:
+        """Return the numbers of an option NAME=NUMBER:NUMBER: so many as the `counts` allow."""
+        values: dict[str, tuple[float, ...]] = {}
         for text in texts or ():
-            name, _, figure = text.partition("=")
-            try:
-                values[name.strip()] = float(figure)
-            except ValueError:
-                self.add(f"{option} is '{text}'; give NAME=VALUE, such as {option} mass=0.3.")
+            name, _, figures = text.partition("=")
+            numbers: tuple[float, ...] = ()
+            with suppress(ValueError):
+                numbers = tuple(float(figure) for figure in figures.split(":"))
+            if len(numbers) in counts:
+                values[name.strip()] = numbers
+            else:
+                self.add(f"{option} is '{text}'; give {form}.")
         return values
 
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
@@ -394,14 +405,9 @@ def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Mo
 
 def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
-    free: dict[str, tuple[float, float] | None] = {}
-    for text in fitting.free or ():
-        name, equals, bounds = text.partition("=")
-        low, _, high = bounds.partition(":")
-        try:
-            free[name.strip()] = (float(low), float(high)) if equals else None
-        except ValueError:
-            inputs.add(f"--free is '{text}'; give NAME=LOW:HIGH, such as --free mass=0.1:10.")
+    form, texts = "NAME=LOW:HIGH, such as --free mass=0.1:10", fitting.free or []
+    bounds = inputs.named("--free", [t for t in texts if "=" in t], form, (2,))
+    free: dict[str, Any] = {n.strip(): bounds.get(n.strip()) for n in fitting.words.get("free", ())}
     values = inputs.numbers("--value", fitting.value)
     inputs.check()
     return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
