@@ -50,7 +50,7 @@ def _word(code: str, table: str, other: str | None = None) -> Any:
 
 def plural(count: Any, one: str, several: str) -> str:
     """Return the word for a number of things, or for so many as there are."""
-    return one if (count if isinstance(count, int | float) else len(count)) == 1 else several
+    return one if (len(count) if hasattr(count, "__len__") else count) == 1 else several
 
 
 def _times(count: float) -> str:
@@ -108,8 +108,8 @@ CATALOGUE = Environment(
 )  # fmt: skip
 CATALOGUE.globals["infinity"] = math.inf
 _OF_PHRASES = (
-    "confidence_text", "either", "listing", "number", "percent", "plain", "raised", "with_unit",
-    "within",
+    "confidence_text", "counted", "either", "listing", "number", "percent", "plain", "raised",
+    "with_unit", "within",
 )  # fmt: skip
 CATALOGUE.filters |= {name: getattr(phrases, name) for name in _OF_PHRASES}
 CATALOGUE.filters |= {
