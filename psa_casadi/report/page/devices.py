@@ -148,7 +148,7 @@ def write_population(
         badges,
         p=p,
         **words.population_tables(p),
-        spreads_drawn=spreads,
+        spread_order=spreads,
         without=Table(("device", "ended", "why"), tuple(without)) if without else None,
     )
     atomic_write(path, page)

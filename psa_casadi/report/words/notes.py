@@ -69,20 +69,20 @@ def plan_words(p: Plan, *, sampled: bool = True) -> str:
 def profile_sentences(p: Profile) -> tuple[str, ...]:
     """Return a profile in words: its interval with open ends, and what is odd about it."""
 
-    def shown(value: float) -> str:
+    def in_unit(value: float) -> str:
         number = f"{convert(value, p.unit, p.display_unit):.4g}"
         return number if p.unit == "1" else f"{number} {p.display_unit}"
 
-    low, high = (None if end is None else shown(end) for end in (p.low, p.high))
-    first, last = (shown(float(v)) for v in p.values[[0, -1]])
-    ends = {"low": low, "high": high, "first": first, "last": last, "estimate": shown(p.estimate)}
+    low, high = (None if end is None else in_unit(end) for end in (p.low, p.high))
+    first, last = (in_unit(float(v)) for v in p.values[[0, -1]])
+    ends = {"low": low, "high": high, "first": first, "last": last, "estimate": in_unit(p.estimate)}
     kinds = (("open", "below"), ("above", "between"))
     kind = kinds[low is not None][high is not None]
     interval = say(f"profile.{kind}", name=p.name, **ends)
     at_estimate = float(np.interp(p.estimate, p.values, p.increase))
     if kind == "open" or at_estimate <= 0.1 * PROFILE_LIMIT:
         return (interval,)
-    best = shown(float(p.values[np.argmin(p.increase)]))
+    best = in_unit(float(p.values[np.argmin(p.increase)]))
     values = {"best": best, "lower": at_estimate, "limit": PROFILE_LIMIT}
     return interval, say("profile.not_minimal", name=p.name, **values)
 
