@@ -1,4 +1,4 @@
-"""Texts by table and code, from `sentences.toml`, with the values in their places."""
+"""Texts by table and code, from the TOML files here, with the values in their places."""
 
 import math
 import tomllib
@@ -15,9 +15,9 @@ from psa_casadi.report.words import phrases
 from psa_casadi.report.words.phrases import listing
 
 #: The tables of texts by code.
-TABLES: dict[str, dict[str, Any]] = tomllib.loads(
-    files("psa_casadi.report.words").joinpath("sentences.toml").read_text("utf-8")
-)
+TABLES: dict[str, dict[str, Any]] = {}
+for _file in ("notes.toml", "sentences.toml", "words.toml"):
+    TABLES |= tomllib.loads(files("psa_casadi.report.words").joinpath(_file).read_text("utf-8"))
 
 #: Titles of views along the coordinates of a residual, and labels of their axes.
 TITLES: Mapping[str, str] = TABLES["axis_title"]

@@ -1,6 +1,6 @@
 """Notes, combinations, advice, profiles and errors of fits in sentences.
 
-Results carry codes and figures; `sentences.toml` has the text of each code.
+Results carry codes and figures; `notes.toml` and `sentences.toml` have the text of each code.
 """
 
 from functools import singledispatch
