@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs, step_seconds
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model, step_seconds
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written
 
 
@@ -50,6 +49,7 @@ def linearize(
         psa linearize --stack P-885.51 --at voltage=60 -o stack.mat --figure bode.png
     """
     from psa_casadi.report.plots.figures import bode_figure, write_figure
+    from psa_casadi.report.words.catalogue import say
 
     inputs.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
     chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
@@ -62,12 +62,7 @@ def linearize(
     show(repr(result))
     if loop is not None:
         m = psa.margins(result, loop, input=from_, output=to)
-        ends = "stable" if m["stable"] else "NOT STABLE"
-        show(
-            f"loop: gain margin {m['gain_margin']:.4g} at {m['gain_margin_at']:.4g} Hz, phase"
-            f" margin {m['phase_margin']:.4g} degrees at {m['phase_margin_at']:.4g} Hz, delay"
-            f" margin {m['delay_margin']:.4g} s; the closed loop is {ends}"
-        )
+        show(say("command.loop", m=m))
     if output is not None:
         result.save(output)
     if figure is not None:

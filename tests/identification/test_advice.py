@@ -7,7 +7,7 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records import Record
 from psa_casadi.records.split import whole
-from psa_casadi.report.words.advice_words import plan_words
+from psa_casadi.report.words.notes import plan_words
 from tests.identification.loop_fits import FREE, NOISE, loops, measured
 from tests.model.stack_models import stack
 from tests.studies.benchmarks.records import loop_voltage

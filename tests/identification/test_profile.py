@@ -18,7 +18,7 @@ from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import Record, multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.report.plots.findings import profile_plot
-from psa_casadi.report.words.advice_words import profile_sentences
+from psa_casadi.report.words.notes import profile_sentences
 from psa_casadi.simulation.simulate import simulate
 
 SIGMA = 2e-8

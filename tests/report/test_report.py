@@ -15,7 +15,7 @@ from psa_casadi.export.check.check import CheckRow
 from psa_casadi.report.page import results
 from psa_casadi.report.plots.records import distribution_plot, time_plot
 from psa_casadi.report.words import colours, series
-from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.notes import residual_sentence
 from psa_casadi.report.words.phrases import Scale, number, probability_text
 from psa_casadi.report.words.tables import check_table
 from psa_casadi.report.words.text import check_sentence

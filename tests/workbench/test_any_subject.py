@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
-from psa_casadi.cli.own_model import Fitting, own_model
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.web import _subject
 from psa_casadi.cli.workbench.desk import Desk
 from psa_casadi.cli.workbench.server import served
