@@ -77,7 +77,7 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
 
 def notch_response(z: ComplexArray, period: float, frequency: float, floor: float, width: float
 ) -> ComplexArray:  # fmt: skip
-    """Return the notch that `POSITION_CONTROLLER` has, on the unit circle."""
+    """Return the notch that `position_controller` has, on the unit circle."""
     t = np.tan(min(np.pi * frequency * period, 1.5))
     w = (z - 1.0) / (z + 1.0) / t
     ratio: ComplexArray = (w * w + 2.0 * floor * w + 1.0) / (w * w + 2.0 * width * w + 1.0)
