@@ -32,7 +32,7 @@ from psa_casadi.model.effects.strain import (
     saturation_of_strain,
     self_heating,
 )
-from psa_casadi.model.scales import stiffness_scale, stroke_scale
+from psa_casadi.model.shapes import stiffness_scale, stroke_scale
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate

@@ -17,7 +17,7 @@ from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, R
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, structural_mode
-from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.shapes import stiffness_scale
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side

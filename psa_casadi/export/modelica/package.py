@@ -38,7 +38,7 @@ from psa_casadi.export.modelica.expression import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.model.effects.mechanics import reciprocal_coupling
-from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.shapes import stiffness_scale
 from psa_casadi.model.variables import Input, nominal_value
 
 

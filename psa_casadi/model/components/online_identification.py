@@ -14,13 +14,8 @@ from itertools import islice
 
 import casadi as ca
 
-from psa_casadi.model.component import (
-    Equations,
-    Expression,
-    Symbols,
-    component,
-)
-from psa_casadi.model.scales import hysteresis_scale, voltage_scale
+from psa_casadi.model.component import Equations, Expression, Symbols, component
+from psa_casadi.model.shapes import hysteresis_scale, voltage_scale
 from psa_casadi.model.variables import Input, Output, Parameter, State, Values
 
 #: Parameters that are tracked, in the order of z, and the unit of each.

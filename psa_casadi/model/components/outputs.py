@@ -9,14 +9,8 @@ from functools import partial
 
 import casadi as ca
 
-from psa_casadi.model.component import (
-    Component,
-    Equations,
-    Expression,
-    Symbols,
-    component,
-)
-from psa_casadi.model.scales import stroke_scale, voltage_scale
+from psa_casadi.model.component import Component, Equations, Expression, Symbols, component
+from psa_casadi.model.shapes import stroke_scale, voltage_scale
 from psa_casadi.model.variables import Output, Parameter, Values
 
 

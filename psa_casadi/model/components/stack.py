@@ -1,12 +1,8 @@
 """The stack itself: drive, forces, hysteresis, lag, mechanics and an ideal sensor."""
 
 from psa_casadi.model import shapes
-from psa_casadi.model.component import (
-    Equations,
-    Symbols,
-    component,
-)
-from psa_casadi.model.scales import (
+from psa_casadi.model.component import Equations, Symbols, component
+from psa_casadi.model.shapes import (
     charge_scale,
     current_scale,
     force_scale,

@@ -12,14 +12,8 @@ from dataclasses import replace
 
 import casadi as ca
 
-from psa_casadi.model.component import (
-    Equations,
-    Expression,
-    Symbols,
-    component,
-    effect,
-)
-from psa_casadi.model.scales import force_scale, hysteresis_scale, voltage_scale
+from psa_casadi.model.component import Equations, Expression, Symbols, component, effect
+from psa_casadi.model.shapes import force_scale, hysteresis_scale, voltage_scale
 from psa_casadi.model.variables import Input, Output, Parameter, State, Values
 
 

@@ -2,13 +2,7 @@
 
 import casadi as ca
 
-from psa_casadi.model.component import (
-    Equations,
-    Remedy,
-    Symbols,
-    effect,
-)
-from psa_casadi.model.scales import voltage_scale
+from psa_casadi.model.component import Equations, Remedy, Symbols, effect
 from psa_casadi.model.shapes import (
     ANGLES,
     BEND_TEXT,
@@ -17,6 +11,7 @@ from psa_casadi.model.shapes import (
     shape_parameters,
     share,
     softplus,
+    voltage_scale,
 )
 from psa_casadi.model.variables import Parameter, State, Values
 

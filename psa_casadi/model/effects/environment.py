@@ -10,8 +10,7 @@ from psa_casadi.model.component import (
     Symbols,
     effect,
 )
-from psa_casadi.model.scales import reading_scale, stroke
-from psa_casadi.model.shapes import positive, share
+from psa_casadi.model.shapes import positive, reading_scale, share, stroke
 from psa_casadi.model.variables import Input, Parameter, State
 
 

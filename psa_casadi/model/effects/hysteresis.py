@@ -3,12 +3,7 @@
 import casadi as ca
 
 from psa_casadi.model import shapes
-from psa_casadi.model.component import (
-    Equations,
-    Remedy,
-    Symbols,
-    effect,
-)
+from psa_casadi.model.component import Equations, Remedy, Symbols, effect
 from psa_casadi.model.variables import Parameter, Values
 
 #: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.

@@ -13,7 +13,6 @@ from psa_casadi.model.component import (
     Symbols,
     effect,
 )
-from psa_casadi.model.scales import static_stiffness, stroke, stroke_scale, velocity_scale
 from psa_casadi.model.shapes import (
     ANGLES,
     BEND_TEXT,
@@ -25,6 +24,10 @@ from psa_casadi.model.shapes import (
     share,
     signed_power,
     smooth_magnitude,
+    static_stiffness,
+    stroke,
+    stroke_scale,
+    velocity_scale,
 )
 from psa_casadi.model.variables import Parameter, State, Values
 

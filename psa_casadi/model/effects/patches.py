@@ -10,8 +10,14 @@ from collections.abc import Callable, Mapping
 import casadi as ca
 
 from psa_casadi.model.component import Component, Equations, Expression, Symbols
-from psa_casadi.model.scales import reading_scale, static_stiffness, stroke_scale, voltage_scale
-from psa_casadi.model.shapes import stop_rate, stop_rates
+from psa_casadi.model.shapes import (
+    reading_scale,
+    static_stiffness,
+    stop_rate,
+    stop_rates,
+    stroke_scale,
+    voltage_scale,
+)
 from psa_casadi.model.variables import Nominal, Parameter, State
 
 #: Terms of a curve and of one for each direction or over time; play and stop elements; relaxations.

@@ -14,7 +14,7 @@ from psa_casadi.model.component import (
     Symbols,
     effect,
 )
-from psa_casadi.model.scales import reading_scale, stroke, stroke_scale
+from psa_casadi.model.shapes import reading_scale, stroke, stroke_scale
 from psa_casadi.model.variables import Parameter, State, Values
 
 #: Smallest time constant of a section [s]; keeps it defined at zero delay.

@@ -2,12 +2,7 @@
 
 import casadi as ca
 
-from psa_casadi.model.component import (
-    Equations,
-    Remedy,
-    Symbols,
-    effect,
-)
+from psa_casadi.model.component import Equations, Remedy, Symbols, effect
 from psa_casadi.model.shapes import (
     form,
     magnitude_power,
