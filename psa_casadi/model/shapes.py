@@ -297,6 +297,16 @@ def positive(
     return Parameter(name, value, unit, bounds, description, log=True, limit=limit)
 
 
+def reading(name: str, description: str) -> Parameter:
+    """Return the size of an error of a reading [m]."""
+    return Parameter(name, 0.0, "m", (-1e-3, 1e-3), description, "um", scale=reading_scale)
+
+
+def delay(name: str, description: str) -> Parameter:
+    """Return a delay or lag [s] that is a gain: 0 removes it."""
+    return Parameter(name, 0.0, "s", (0.0, 0.1), description, "ms", scale=1e-4)
+
+
 def form(name: str, description: str) -> Parameter:
     """Return what chooses between two forms, 0 and 1; it is tried and not fitted."""
     return Parameter(name, 0.0, "1", (0.0, 1.0), description, fitted=False)

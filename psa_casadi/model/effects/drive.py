@@ -7,6 +7,7 @@ from psa_casadi.model.shapes import (
     ANGLES,
     BEND_TEXT,
     bend,
+    delay,
     positive,
     shape_parameters,
     share,
@@ -86,9 +87,7 @@ _FLOOR = 1e-6
 
 
 @effect(
-    Parameter(
-        "drive_lag_time", 0.0, "s", (0.0, 0.1), "time constant of the drive", "ms", scale=1e-4
-    ),
+    delay("drive_lag_time", "time constant of the drive"),
     positive(
         "drive_lag_shape",
         0.25,

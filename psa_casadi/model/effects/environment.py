@@ -10,7 +10,7 @@ from psa_casadi.model.component import (
     Symbols,
     effect,
 )
-from psa_casadi.model.shapes import positive, reading_scale, share, stroke
+from psa_casadi.model.shapes import positive, reading, reading_scale, share, stroke
 from psa_casadi.model.variables import Input, Parameter, State
 
 
@@ -53,7 +53,7 @@ def _part(name: str) -> State:
 
 
 @effect(
-    Parameter("hum_gain", 0.0, "m", (-1e-3, 1e-3), "size of the hum", "um", scale=reading_scale),
+    reading("hum_gain", "size of the hum"),
     Parameter("hum_frequency", 50.0, "Hz", (0.05, 1e5), "frequency of the line", log=True),
     _part("cosine"),
     _part("sine"),

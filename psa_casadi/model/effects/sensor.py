@@ -14,7 +14,7 @@ from psa_casadi.model.component import (
     Symbols,
     effect,
 )
-from psa_casadi.model.shapes import reading_scale, stroke, stroke_scale
+from psa_casadi.model.shapes import stroke, stroke_scale
 from psa_casadi.model.variables import Parameter, State, Values
 
 #: Smallest time constant of a section [s]; keeps it defined at zero delay.
@@ -29,7 +29,7 @@ def _states(index: int) -> tuple[State, State]:
 
 
 @effect(
-    Parameter("sensor_delay", 0.0, "s", (0.0, 0.1), "delay of the sensor", "ms", scale=1e-4),
+    shapes.delay("sensor_delay", "delay of the sensor"),
     *_states(1),
     *_states(2),
     kind="lag",
@@ -60,9 +60,7 @@ _LAG_FLOOR = 1e-6
 
 
 @effect(
-    Parameter(
-        "sensor_lag_time", 0.0, "s", (0.0, 0.1), "time constant of the sensor", "ms", scale=1e-4
-    ),
+    shapes.delay("sensor_lag_time", "time constant of the sensor"),
     shapes.motion("sensor_lag_displacement", "displacement behind the lag"),
     kind="lag",
     description="the sensor follows the displacement with a time constant",
@@ -127,9 +125,7 @@ def _second(name: str) -> Parameter:
 
 
 @effect(
-    Parameter(
-        "ripple_gain", 0.0, "m", (-1e-3, 1e-3), "size of the ripple", "um", scale=reading_scale
-    ),
+    shapes.reading("ripple_gain", "size of the ripple"),
     Parameter(
         "ripple_period", 2e-6, "m", (1e-9, 1e-2), "displacement of one period", "um", log=True
     ),
@@ -168,7 +164,7 @@ def _place_scale(p: Values) -> float:
 
 
 @effect(
-    Parameter("jump_gain", 0.0, "m", (-1e-3, 1e-3), "size of the jump", "um", scale=reading_scale),
+    shapes.reading("jump_gain", "size of the jump"),
     Parameter(
         "jump_place", 5e-6, "m", (-1e-2, 1e-2), "displacement of it", "um", scale=_place_scale
     ),

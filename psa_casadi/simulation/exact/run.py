@@ -23,7 +23,7 @@ from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
-from psa_casadi.simulation.timings import count_run, count_steps
+from psa_casadi.simulation.timings import count_run
 
 #: A sample is halved this many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12
@@ -248,7 +248,6 @@ def _run(
     if reason:
         raise NotExact(reason)
     t, u, hold = record
-    count_run(differentiated=count > 0)
     lengths, which_step = time_steps(t)
     times = {"t": doubles(t), "v": doubles(u), "length": lengths}
     table: dict[str, npt.NDArray[Any]] = {**times, "which_step": which_step, **arrays}
@@ -258,7 +257,8 @@ def _run(
         **{name: array.ctypes.data for name, array in table.items()},
     )  # fmt: skip
     status = _library(structure, outputs, lanes).psa_run_exact(ctypes.byref(request))
-    count_steps((request.steps + request.rejected) * (1 + count))
+    steps = (request.steps + request.rejected) * (1 + count)
+    count_run(steps, differentiated=count > 0)
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status:
