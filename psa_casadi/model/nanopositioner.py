@@ -38,11 +38,8 @@ class PlantResponse:
 
 def plant_response(plant: Model, position: str | None, period: float, lag: float) -> PlantResponse:
     """Return the exactly discretised response of the plant, linearised, behind a lag [s]."""
-    s = plant.structure
     row = plant.output_names.index(position) if position else 0
-    start = [v.start for v in s.states], [v.start for v in s.inputs]
-    slopes = s.slopes(0.0, *start, plant.parameter_vector())
-    A, B, C, _ = (np.array(m, dtype=float) for m in slopes)
+    A, B, C, _ = (np.array(m, dtype=float) for m in plant.structure.slopes(*plant.at_start()))
     size, n = plant.state_nominals(), len(A) + 1
     A, B, C = A * size / size[:, None], B / size[:, None], C[[row]] * size
     # the output behind a lag of first order
