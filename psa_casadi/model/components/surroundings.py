@@ -236,17 +236,15 @@ def prestress_on_wafers(s: Symbols) -> Equations:
     return Equations(add={"wafer_force": -s.mounted * force})
 
 
+PRESTRESS_ON_TIP = replace(
+    prestress_on_wafers,
+    name="prestress_on_tip",
+    description="prestress mechanism that pushes on the output mass of a stack",
+    equation_text="(m_B + m) x'' = F - c x' - k x,  F: all else that acts on the output mass",
+    equations=_on_tip,
+)
 #: A mechanism around a stack in one model: its force acts at the key.
-PRESTRESS_MOUNTS = {
-    "wafers": prestress_on_wafers,
-    "tip": replace(
-        prestress_on_wafers,
-        name="prestress_on_tip",
-        description="prestress mechanism that pushes on the output mass of a stack",
-        equation_text="(m_B + m) x'' = F - c x' - k x,  F: all else that acts on the output mass",
-        equations=_on_tip,
-    ),
-}
+PRESTRESS_MOUNTS = {"wafers": prestress_on_wafers, "tip": PRESTRESS_ON_TIP}
 
 
 #: Largest half angle of the notch in one period [rad]: just below that of the Nyquist frequency.
