@@ -21,16 +21,16 @@ from psa_casadi.model.component import Component
 from psa_casadi.model.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.effects import EFFECTS
+from psa_casadi.model.effects.ageing import ageing, self_heating
 from psa_casadi.model.effects.drive import charge_leakage, drive_lag, voltage_saturation
 from psa_casadi.model.effects.environment import mains_hum, temperature
-from psa_casadi.model.effects.hysteresis import hysteresis_memory, rate_dependent_hysteresis
 from psa_casadi.model.effects.mechanics import backlash, load_stiffness, preload_loss
 from psa_casadi.model.effects.sensor import sensor_jump, sensor_nonlinearity, sensor_ripple
 from psa_casadi.model.effects.strain import (
-    ageing,
     field_dependent_gain,
+    hysteresis_memory,
+    rate_dependent_hysteresis,
     saturation_of_strain,
-    self_heating,
 )
 from psa_casadi.model.shapes import stiffness_scale, stroke_scale
 from psa_casadi.model.stacks import STACKS
