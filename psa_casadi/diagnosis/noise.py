@@ -171,7 +171,7 @@ def _source(record: Record) -> tuple[Source, MeasuredNoise | None, Note]:
         return "repeats", again, note("noise_repeats", apart=(again.distances[0], "s"))
     still = holds(record)
     if still is not None and still.samples >= ENOUGH:
-        return "holds", still, note("noise_holds", count=still.count)
+        return "holds", still, note("noise_holds", count=still.holds)
     return _FAST_PART
 
 

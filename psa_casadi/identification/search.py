@@ -40,7 +40,7 @@ from psa_casadi.identification.start.starting_points import (
     resolved,
     starting_points,
 )
-from psa_casadi.model.components.stack import MEMORY_SPECTRUM
+from psa_casadi.model.components.stack import memory_spectrum
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
@@ -49,7 +49,7 @@ from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = (
-    *("k_L", "A", "beta", "gamma", "delta", "n", *MEMORY_SPECTRUM.fitted),
+    *("k_L", "A", "beta", "gamma", "delta", "n", *memory_spectrum.fitted),
     *("tau", "R_s", "c_P", "c_B", "c"),
 )
 

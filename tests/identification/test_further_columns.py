@@ -20,7 +20,7 @@ from psa_casadi.identification.fitting.fit import Objective, fit
 from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
-from psa_casadi.model.components.surroundings import FLEXURE
+from psa_casadi.model.components.surroundings import flexure
 from psa_casadi.model.compose import compose
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.records.read.reading import read_record
@@ -128,7 +128,7 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         strain=0.0 * time,
     )
     with pytest.raises(InputError, match="'monitor_voltage', but the model 'psa' does not give it"):
-        columns_of(compose([FLEXURE]), [r])
+        columns_of(compose([flexure]), [r])
     result = columns_of(starting_model([r]), [r])
     assert result.fitted == ("monitor_voltage",)
     assert texts(result.left_out) == ("strain is left out: it never changes.",)

@@ -38,9 +38,9 @@ from psa_casadi.design.mechanism.loop import (
     stroke_loss,
 )
 from psa_casadi.model.components.surroundings import (
-    PRESTRESS_MECHANISM,
     PRESTRESS_MOUNTS,
-    PRESTRESS_PORT,
+    prestress_mechanism,
+    prestress_port,
 )
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.variables import Provenance
@@ -433,13 +433,13 @@ def mechanism_model(design: MechanismDesign, name: str = "mechanism") -> Model:
         f"The lag's pole at {design.lag_pole:.5g} rad/s stays where it is.",
     )
     values = {"m_m": m.mass, "c_m": m.damping, "k_m": m.stiffness}
-    model = compose([PRESTRESS_MECHANISM], values, name=name, description="prestress mechanism")
+    model = compose([prestress_mechanism], values, name=name, description="prestress mechanism")
     return model.with_values({}, provenance=Provenance(notes=notes))
 
 
 def port_model(model: Model) -> Model:
     """Return a stack with the port for a mechanism's force and the motion of its tip."""
-    return model.with_components((*model.plant().components, PRESTRESS_PORT))
+    return model.with_components((*model.plant().components, prestress_port))
 
 
 def mounted_model(model: Model, design: MechanismDesign) -> Model:

@@ -255,7 +255,7 @@ def _hysteresis(at: _Sum, x: str) -> Attached:
 
 def changing(model: Model, sizes: Sizes) -> tuple[Attached, ...]:
     """Return how every parameter and intermediate may change with states, inputs and time."""
-    states = [q.name for c in model.components if c.gain is None for q in c.states]
+    states = [q.name for c in model.base for q in c.states]
     known = {i.name: i.unit for i in model.structure.inputs}
     marked = [p for p in ports.ports_of(model) if p.kind == "intermediate"]
     attacheds: list[Attached] = []

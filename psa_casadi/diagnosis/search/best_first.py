@@ -18,7 +18,7 @@ from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.state import FINALISTS, NONE, Names, SearchState
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.model.effects.mechanics import STRUCTURAL_MODE
+from psa_casadi.model.effects.mechanics import structural_mode
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import Work, counted, stage
 
@@ -247,8 +247,8 @@ class _Search:
 
         Where fast records show several, or where one leaves structure.
         """
-        name = STRUCTURAL_MODE.name
-        if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
+        name = structural_mode.name
+        if structural_mode not in self.task.table or not view.test.alarm:
             return False
         less = self.known.hypotheses.get(h.names - {name})
         if less is None or not (name in h.names or (self.task.fast and not h.causes)):
@@ -310,7 +310,7 @@ class _Search:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
             for one in moves.one_mode(h, before):
                 self.known.note(one)
-            self.known.remember(before, STRUCTURAL_MODE.name)
+            self.known.remember(before, structural_mode.name)
         if before is None or has_series(h) or not self.does("resonances"):
             return
         last, fit = h.causes[-1], None

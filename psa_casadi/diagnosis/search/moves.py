@@ -16,8 +16,8 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Response, modes_of
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
-from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, structural_mode
+from psa_casadi.model.shapes import stiffness_scale
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -87,7 +87,7 @@ def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """
     fit = series.fit
     states = tuple(fit.starts())
-    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
+    low, high = next(p.bounds for p in structural_mode.parameters if p.name == "mode_lead")
     starts: list[fits.Start] = []
     for mode in _modes(fit, series.causes[-1].count):
         lead = float(np.clip(mode.ahead / (mode.share or 1e-300), low, high))
@@ -95,7 +95,7 @@ def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    results = side_by_side(lambda s: fits.exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
+    results = side_by_side(lambda s: fits.exchanged(series, less, structural_mode, s, fit), starts)
     best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
     return side_by_side(fits.to_end, best)
 
