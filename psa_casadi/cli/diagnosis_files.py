@@ -12,7 +12,7 @@ from psa_casadi.common.errors import PsaError
 from psa_casadi.common.files import atomic_write
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.records import write_record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number

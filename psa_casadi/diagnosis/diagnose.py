@@ -20,7 +20,7 @@ from psa_casadi.diagnosis.reference import Healthy, Since
 from psa_casadi.diagnosis.result import Decision, DiagnosisInterrupted, StackDiagnosis, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
-from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
+from psa_casadi.diagnosis.search.state import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.identification.fitting.fit import Fit, fit

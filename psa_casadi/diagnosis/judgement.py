@@ -10,12 +10,27 @@ import numpy as np
 from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import noise_left, noise_told
-from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
-from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
-from psa_casadi.diagnosis.families import SUREST, CauseEvidence, Family, families, place_and_kind
+from psa_casadi.diagnosis.corrections import (
+    SUREST,
+    CauseEvidence,
+    Correction,
+    Family,
+    FreeFunction,
+    best_of,
+    estimates,
+    families,
+    place_and_kind,
+)
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
-from psa_casadi.diagnosis.generic.attached import Attached
-from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
+from psa_casadi.diagnosis.generic.of_signals import Attached
+from psa_casadi.diagnosis.held_out import (
+    Budget,
+    Share,
+    budget,
+    held_out_within,
+    removed_from,
+    too_few_held_out,
+)
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
@@ -29,8 +44,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
-from psa_casadi.diagnosis.search.state import SearchState
-from psa_casadi.diagnosis.search.steps import Step, steps_of
+from psa_casadi.diagnosis.search.state import SearchState, Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.result import EXCESSIVE
 from psa_casadi.model.component import Component

@@ -8,8 +8,7 @@ import numpy as np
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, noise_rms
-from psa_casadi.diagnosis.noise import detection_limit_of
-from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
+from psa_casadi.diagnosis.noise import Omnibus, detection_limit_of, omnibus
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.identification.fitting.fit import Fit

@@ -18,8 +18,7 @@ import scipy
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray, rate_unit
-from psa_casadi.diagnosis.colour import Colour, rms
-from psa_casadi.diagnosis.own_colour import Entering, OwnColour, price_of, windows
+from psa_casadi.diagnosis.colour import Colour, Entering, OwnColour, price_of, rms, windows
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model

@@ -15,8 +15,8 @@ from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis import held_out
-from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
+from psa_casadi.diagnosis.held_out import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.judgement import Judge, indistinguishable
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
@@ -34,7 +34,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
-from psa_casadi.diagnosis.search.steps import Step, contenders
+from psa_casadi.diagnosis.search.state import Step, contenders
 from psa_casadi.diagnosis.task import Thresholds, same_curves
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.evidence import evidence_of

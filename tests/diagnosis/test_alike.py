@@ -10,7 +10,7 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.pack import STACK, Task
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose

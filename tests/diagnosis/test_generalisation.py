@@ -8,10 +8,10 @@ import pytest
 from scipy.signal import lfilter
 
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.confirmation import held_out_excess
+from psa_casadi.diagnosis.colour import OwnColour, own_colour
 from psa_casadi.diagnosis.diagnose import diagnose
+from psa_casadi.diagnosis.held_out import held_out_excess
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.components import BASE

@@ -31,7 +31,7 @@ from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, coars
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model

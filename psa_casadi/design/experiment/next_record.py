@@ -29,11 +29,11 @@ from psa_casadi.design.experiment.experiment import (
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
 from psa_casadi.design.experiment.search import Effort
-from psa_casadi.diagnosis.generic.attached import Attached, extended, of_ones_own
 from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic.of_signals import Attached, extended, of_ones_own
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Contender
-from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals
+from psa_casadi.diagnosis.search.state import fit_contenders, fitted_rivals
 from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, search_starts

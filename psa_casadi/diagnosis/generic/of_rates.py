@@ -8,19 +8,23 @@ from dataclasses import dataclass, replace
 import casadi as ca
 
 from psa_casadi.common.units import rate_unit
-from psa_casadi.diagnosis.generic.attached import (
+from psa_casadi.diagnosis.generic.of_signals import (
+    ANGLE,
     LARGEST,
     ORDINARY,
     Attached,
     SymbolOf,
     Terms,
     at_port,
+    bent,
+    beyond,
+    level_of,
     rounded,
     scale_of,
+    signal_effects,
     size_at,
     size_of,
 )
-from psa_casadi.diagnosis.generic.of_signals import ANGLE, bent, beyond, level_of, signal_effects
 from psa_casadi.model import ports
 from psa_casadi.model.component import Expression, Symbols
 from psa_casadi.model.compose import Model

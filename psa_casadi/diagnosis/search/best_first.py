@@ -12,7 +12,7 @@ import numpy as np
 from psa_casadi.common.notes import note
 from psa_casadi.diagnosis import base_fit
 from psa_casadi.diagnosis.colour import noise_rms
-from psa_casadi.diagnosis.families import CauseEvidence
+from psa_casadi.diagnosis.corrections import CauseEvidence
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis

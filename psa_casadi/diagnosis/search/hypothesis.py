@@ -22,11 +22,9 @@ import scipy
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
+from psa_casadi.diagnosis.colour import Colour, OwnColour, own_colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
-from psa_casadi.diagnosis.noise import known_colour
-from psa_casadi.diagnosis.omnibus import Omnibus
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
+from psa_casadi.diagnosis.noise import Omnibus, known_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.process_noise import entering

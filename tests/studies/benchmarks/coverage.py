@@ -14,7 +14,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.omnibus import whiteness
+from psa_casadi.diagnosis.noise import whiteness
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from tests.studies.benchmarks.records import Values, clean_set, with_noise
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
