@@ -84,16 +84,14 @@ class Colour:
             white /= self.spread.reshape(-1, *(1,) * (signal.ndim - 1))
         return white
 
-    def whiten_all(self, signal: FloatArray, further: Sequence[FloatArray]) -> FloatArray:
-        """Filter a signal of the displacement and those of the further columns, and stack them.
+    def whiten_all(self, signals: Sequence[FloatArray]) -> FloatArray:
+        """Filter the signals of all channels, and stack them.
 
         A further one counts over its noise level, in metres of that of the displacement.
         """
-        if not further:
-            return self.whiten(signal)
-        pairs = zip(self.further, further, strict=True)
-        others = [self.level / c.level * c.whiten(part) for c, part in pairs]
-        return np.concatenate([self.whiten(signal), *others])
+        pairs = zip(self.each, signals, strict=True)
+        white = [self.level / c.level * c.whiten(part) for c, part in pairs]
+        return np.concatenate(white) if self.further else white[0]
 
 
 def colour_of(
@@ -220,13 +218,12 @@ def noise_told(
     return weighted, tuple(levels)
 
 
-def excess_power(residual: FloatArray, colour: Colour, floor: float | None = None) -> float:
+def excess_power(residual: FloatArray, floor: float) -> float:
     """Return the power [m^2] of a residual above its noise, negative where that is less.
 
-    The noise's power is `floor`^2, or what `noise_rms` finds, and what that is uncertain by.
+    The noise's power is `floor`^2, and what that is uncertain by.
     """
-    level = noise_rms(residual, colour) if floor is None else floor
-    return float(np.mean(residual**2)) - level**2 * (1.0 + uncertain(residual))
+    return float(np.mean(residual**2)) - floor**2 * (1.0 + uncertain(residual))
 
 
 def rms(values: FloatArray) -> float:

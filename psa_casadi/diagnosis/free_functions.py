@@ -305,10 +305,9 @@ def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     columns = tangents(fit, now.hypothesis.experiments, effects)
     at = [k for k, e in enumerate(effects) if e.name in columns]
     sizes = np.array([effects[k].parameters[0].typical(fit.model.values) for k in at])
-    first, further = zip(*(columns[effects[k].name] for k in at), strict=True)
     colour = now.hypothesis.colour
-    others = [np.column_stack(part) for part in zip(*further, strict=True)]
-    white = colour.whiten_all(np.column_stack(first), others)
+    every = zip(*(columns[effects[k].name] for k in at), strict=True)
+    white = colour.whiten_all([np.column_stack(part) for part in every])
     factors = np.array([known.get(trials[k], 0.0) for k in at])
     target = screening.whitened_residuals(fit, colour) + white @ (factors / sizes)
     kept = [n not in added for n in fit.unknowns.names]
@@ -498,8 +497,8 @@ def _decrease(view: View, component: Component) -> float:
     model = fit.model.with_effect(component)
     moved = {p.name: p.typical(fit.model.values) for p in component.parameters}
     starts = tuple(fit.starts())
-    columns, further = changes(fit, view.of.experiments, model, moved, starts, 0.0)
+    columns, _ = changes(fit, view.of.experiments, model, moved, starts, 0.0)
     basis = screening.independent(screening.whitened_jacobian(fit, colour))
-    free = screening.independent(screening.without(colour.whiten_all(columns, further), basis))
+    free = screening.independent(screening.without(colour.whiten_all(columns), basis))
     residual = screening.without(screening.whitened_residuals(fit, colour), basis)
     return float(np.sum((free.T @ residual) ** 2))

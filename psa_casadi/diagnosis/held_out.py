@@ -164,38 +164,6 @@ def held_out_parts(
     return sums[:, :, 0], counts[:, 0]
 
 
-def gain_of(
-    experiments: Sequence[Experiment], base: Sequence[FloatArray], extended: Sequence[FloatArray]
-) -> Gain:
-    """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
-
-    The interval is that of the ratio's logarithm over the parts of `held_out_parts`.
-    """
-    sums, counts = held_out_parts(experiments, base, extended)
-    records = sum(bool(e.held_out.any()) for e in experiments)
-    centre, half = jackknife(lambda kept: _log_ratio(np.sum(sums[kept], axis=0)), len(counts))
-    gain, low, high = (100.0 * (1.0 - float(np.exp(centre + move))) for move in (0.0, half, -half))
-    return Gain(gain, (low, high), len(counts) if records >= FEWEST_RECORDS else 0)
-
-
-def lost_elsewhere(
-    experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
-    extended: Sequence[FloatArray],
-    inflation: float,
-) -> float:
-    """Return what held-out samples lose, but for the part that gains most [nats].
-
-    That is m ln(E/E_0) over the other parts of `held_out_parts`: m their samples over the noise's
-    `inflation`, E_0 and E the errors' rms. Infinite where there is only one part.
-    """
-    sums, counts = held_out_parts(experiments, base, extended)
-    if len(sums) < 2:
-        return np.inf
-    others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
-    return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
-
-
 def _log_ratio(sums: FloatArray) -> float:
     """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
     before, after = (max(float(s), 1e-300) for s in sums)
@@ -250,15 +218,32 @@ class Share:
 
 @dataclass(frozen=True, eq=False)
 class Removed:
-    """What models remove of the held-out error of a `base` above the `noise`.
+    """What models remove of a base's held-out error above the noise, in its first channels.
 
-    `errors_of` turns a model's predictions of all records into its held-out errors (n, outputs) of
-    each, nan where an output is not judged; `noise` (outputs,) is the rms of each output's noise.
+    `base` are its predictions (n, channels), or (n,) of one, of all records; `noise` (outputs,) is
+    the rms of each channel's noise in its unit.
     """
 
-    errors_of: Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
+    experiments: Sequence[Experiment]
     base: Sequence[FloatArray]
     noise: Sequence[float]
+
+    def budget(
+        self,
+        extended: Sequence[FloatArray],
+        without: Sequence[tuple[str, Sequence[FloatArray]]],
+        correction: tuple[str, Sequence[FloatArray]] | None,
+    ) -> "Budget":
+        """Return the budget of an extended model.
+
+        `without` holds the predictions of the model fitted again without each cause, `correction`
+        those with the best unnamed correction.
+        """
+        return Budget(
+            together=self.share("together", self.base, extended),
+            causes=tuple(self.share(name, less, extended) for name, less in without),
+            unnamed=self.share(correction[0], extended, correction[1]) if correction else None,
+        )
 
     def share(self, what: str, before: Sequence[FloatArray], after: Sequence[FloatArray]) -> Share:
         """Return the share of the base's excess that `after` removes of what `before` leaves."""
@@ -271,15 +256,25 @@ class Removed:
         return of(np.ones(count, dtype=bool))
 
     @cached_property
-    def _base_errors(self) -> Sequence[FloatArray]:
-        return self.errors_of(self.base)
+    def _base_errors(self) -> list[FloatArray]:
+        return self._errors(self.base)
+
+    def _errors(self, predicted: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the errors (n, channels) where any channel is judged, else nan."""
+        judged = [counted(self.experiments, j) for j in range(len(self.noise))]
+        parts = []
+        for e, y, *rows in zip(self.experiments, predicted, *judged, strict=True):
+            which, each = np.column_stack(rows), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(rows))])
+            parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
+        return parts
 
     def _of(
         self, before: Sequence[FloatArray], after: Sequence[FloatArray]
     ) -> tuple[Callable[[BoolArray], float], int]:
         """Return the share over chosen parts, and their number, 0 where there is no excess."""
-        old = self._base_errors if before is self.base else self.errors_of(before)
-        sums, counts = parts_of(self._base_errors, old, self.errors_of(after))
+        old = self._base_errors if before is self.base else self._errors(before)
+        sums, counts = parts_of(self._base_errors, old, self._errors(after))
         floor = np.asarray(self.noise, dtype=np.float64) ** 2
         whole = _powers(sums, counts)[0]
         weights = 1.0 / np.maximum(floor, max(_LEAST_NOISE * float(np.max(whole)), 1e-300))
@@ -330,64 +325,54 @@ class StackBudget(Budget):
     remains_percent: float
 
 
-def removed_from(
-    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: Sequence[float]
-) -> Removed:
-    """Return what models remove of a base's held-out error in its first channels, one a `noise`.
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Predictions of a stack by a `base` and an `extended` model [m], of all records."""
 
-    `base` are its predictions (n, channels), or (n,) of one, of all records; `noise` is the rms of
-    each channel's noise in its unit.
-    """
-    judged = [counted(experiments, j) for j in range(len(noise))]
+    experiments: Sequence[Experiment]
+    base: Sequence[FloatArray]
+    extended: Sequence[FloatArray]
 
-    def errors(arrays: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return the errors (n, channels) where any channel is judged, else nan."""
-        parts = []
-        for e, y, *counted_rows in zip(experiments, arrays, *judged, strict=True):
-            which, each = np.column_stack(counted_rows), y.reshape(len(y), -1).T
-            left = np.column_stack([e.errors(j, each[j]) for j in range(len(counted_rows))])
-            parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
-        return parts
+    @cached_property
+    def parts(self) -> tuple[FloatArray, IndexArray]:
+        """The parts of `held_out_parts` for both models."""
+        return held_out_parts(self.experiments, self.base, self.extended)
 
-    return Removed(errors, base, tuple(noise))
+    @property
+    def gain(self) -> Gain:
+        """The reduction of the held-out rms, with a jackknife interval of the errors' ratio.
 
+        The interval is that of the ratio's logarithm over the parts.
+        """
+        sums, counts = self.parts
+        records = sum(bool(e.held_out.any()) for e in self.experiments)
+        centre, half = jackknife(lambda kept: _log_ratio(np.sum(sums[kept], axis=0)), len(counts))
+        moves = (0.0, half, -half)
+        gain, low, high = (100.0 * (1.0 - float(np.exp(centre + move))) for move in moves)
+        return Gain(gain, (low, high), len(counts) if records >= FEWEST_RECORDS else 0)
 
-def budget(
-    removed: Removed,
-    extended: Sequence[FloatArray],
-    without: Sequence[tuple[str, Sequence[FloatArray]]],
-    correction: tuple[str, Sequence[FloatArray]] | None,
-) -> Budget:
-    """Return the budget of an extended model over a base.
+    def lost_elsewhere(self, inflation: float) -> float:
+        """Return what held-out samples lose, but for the part that gains most [nats].
 
-    `without` holds the predictions of the model fitted again without each cause, `correction` those
-    with the best unnamed correction.
-    """
-    return Budget(
-        together=removed.share("together", removed.base, extended),
-        causes=tuple(removed.share(name, less, extended) for name, less in without),
-        unnamed=removed.share(correction[0], extended, correction[1]) if correction else None,
-    )
+        That is m ln(E/E_0) over the other parts: m their samples over the noise's `inflation`, E_0
+        and E the errors' rms. Infinite where there is only one part.
+        """
+        sums, counts = self.parts
+        if len(sums) < 2:
+            return np.inf
+        others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
+        return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
 
-
-def stack_budget(
-    result: Budget,
-    experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
-    extended: Sequence[FloatArray],
-    noise: float,
-) -> StackBudget:
-    """Return a budget with its lengths; `base` and `extended` are predictions [m]."""
-    powers = _powers(*held_out_parts(experiments, base, extended))
-    excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
-    whole = errors_of(experiments, extended)
-    return StackBudget(
-        **vars(result),
-        excess_rms_m=excess,
-        noise_rms_m=noise,
-        remains_rms_m=remains,
-        remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
-    )
+    def in_lengths(self, budget: Budget, noise: float) -> StackBudget:
+        """Return the budget of the two models with its lengths, by the rms of the noise [m]."""
+        powers = _powers(*self.parts)
+        excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
+        whole = errors_of(self.experiments, self.extended)
+        percent = whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300)
+        return StackBudget(
+            **vars(budget), excess_rms_m=excess, noise_rms_m=noise, remains_rms_m=remains,
+            remains_percent=percent,
+        )  # fmt: skip
 
 
 #: Gain [%] of an error that doubles.

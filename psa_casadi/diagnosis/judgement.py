@@ -23,14 +23,7 @@ from psa_casadi.diagnosis.corrections import (
 )
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
 from psa_casadi.diagnosis.generic.of_signals import Attached
-from psa_casadi.diagnosis.held_out import (
-    Budget,
-    Share,
-    budget,
-    held_out_within,
-    removed_from,
-    too_few_held_out,
-)
+from psa_casadi.diagnosis.held_out import Budget, Removed, Share, held_out_within, too_few_held_out
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
@@ -167,7 +160,7 @@ class Judge:
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
         result = self.corrections(before) if beside else ()
-        removed = removed_from(self.experiments, before.predictions, self.noise)
+        removed = Removed(self.experiments, before.predictions, self.noise)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
@@ -320,8 +313,7 @@ class Judge:
     def budget(self) -> Budget:
         """Where the base's held-out error goes."""
         unnamed = self.reported_correction
-        return budget(
-            removed_from(self.experiments, self.first.view.of.predictions, self.noise),
+        return Removed(self.experiments, self.first.view.of.predictions, self.noise).budget(
             self.final.view.of.predictions,
             [(s.cause.name, s.without.predictions) for s in self.kept if s.without is not None],
             None if unnamed is None else (unnamed.name, unnamed.predicted),

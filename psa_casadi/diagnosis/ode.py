@@ -22,12 +22,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.moves import fit_rivals
 from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Method, Tried
-from psa_casadi.identification.experiments import (
-    column_notes,
-    experiments_of,
-    given_to,
-    undecided,
-)
+from psa_casadi.identification.experiments import column_notes, experiments_of, given_to, undecided
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.inputs import (
     LIKELIER,

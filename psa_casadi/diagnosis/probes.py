@@ -149,21 +149,20 @@ _ROUNDING = 1e-12
 class Direction:
     """One effect at one set of trial values.
 
-    `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
-    times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
-    history. `one_sided`: only positive multiples make sense. `further` are the same
-    changes of the further columns, in their units, without what their offsets can follow. `weight`
-    names the parameter that moves, of several that an effect is linear in (see `spans`).
+    `columns` (samples,) are the changes of the prediction of every channel for the gain `unit_gain`
+    (a derivative times the gain's scale, or a finite step), in the channel's unit, without what its
+    offsets can follow; `values` are the trial values, `memory` the assumed history. `one_sided`:
+    only positive multiples make sense. `weight` names the parameter that moves, of several that an
+    effect is linear in (see `spans`).
     """
 
     effect: Component
     values: dict[str, float]
     memory: tuple[dict[str, float], ...]
     unit_gain: float
-    column: FloatArray
+    columns: tuple[FloatArray, ...]
     one_sided: bool
     finite: bool
-    further: tuple[FloatArray, ...] = ()
     weight: str = ""
 
 
@@ -199,11 +198,11 @@ def directions(
 
 def tangents(
     fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
-) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
+) -> dict[str, tuple[FloatArray, ...]]:
     """Return what each of many effects without states changes, for its gain's ordinary size.
 
-    In fitted samples (samples,), and in every further channel. All at once in one model, or along
-    the fit's course, where they have laws; without those that may err by more than `_ROUGH`.
+    In the fitted samples (samples,) of every channel. All at once in one model, or along the fit's
+    course, where they have laws; without those that may err by more than `_ROUGH`.
     """
     laws = laws_of(fit.model, [e.record for e in experiments if e.stop], effects)
     model = fit.model.with_components((*fit.model.components, *effects))
@@ -211,16 +210,14 @@ def tangents(
     sizes = {n: model.parameter(n).typical(model.values) for n in gains}
     memory = tuple(fit.starts())
     if len(laws) < len(effects):
-        columns, further = changes(fit, experiments, model, sizes, memory, 0.0)
-        return {
-            e.name: (columns[:, k], tuple(f[:, k] for f in further)) for k, e in enumerate(effects)
-        }
+        columns, _ = changes(fit, experiments, model, sizes, memory, 0.0)
+        return {e.name: tuple(c[:, k] for c in columns) for k, e in enumerate(effects)}
     others, table = _Beside(fit, experiments, laws), {}
     for e, gain in zip(effects, gains, strict=True):
         model, moved = fit.model.with_effect(e), {gain: sizes[gain]}
-        columns, further, error = _changes(fit, experiments, model, moved, memory, 0.0, others)
+        columns, error = changes(fit, experiments, model, moved, memory, 0.0, others)
         if error < _ROUGH:
-            table[e.name] = columns[:, 0], tuple(f[:, 0] for f in further)
+            table[e.name] = tuple(c[:, 0] for c in columns)
     return table
 
 
@@ -345,22 +342,20 @@ def _directions_at(
             try:
                 arguments, clear = (fit, experiments, model, moved, memory, step), False
                 if effect.name in alongside.laws:
-                    columns, further, error = _changes(*arguments, alongside)
-                    clear = alongside.is_clear(columns, error)
+                    columns, error = changes(*arguments, alongside)
+                    clear = alongside.is_clear(columns[0], error)
                 if not clear:
-                    columns, further = changes(*arguments)
+                    columns, _ = changes(*arguments)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
-                column, others = columns[:, k], tuple(f[:, k] for f in further)
-                every = np.concatenate([column, *others])
+                each = tuple(c[:, k] for c in columns)
+                every = np.concatenate(each)
                 if not np.all(np.isfinite(every)) or not np.any(every):
                     continue
                 weight, unit = (name, 1.0) if effect.linear else ("", step or size)
                 trial = {**values, name: size} if effect.linear else values
-                yield Direction(
-                    effect, trial, memory, unit, column, one_sided, bool(step), others, weight
-                )
+                yield Direction(effect, trial, memory, unit, each, one_sided, bool(step), weight)
 
 
 def _histories(
@@ -387,27 +382,14 @@ def changes(
     moved: Mapping[str, float],
     memory: tuple[dict[str, float], ...],
     step: float,
-) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return what parameters change in the first channel's fitted samples (samples, m).
-
-    In its unit, over the records' shares of the noise. They are `moved` along their derivatives, by
-    their sizes, or the one by a finite `step`. With it comes what each changes in every further
-    channel, beyond offsets and factors.
-    """
-    columns, further, _ = _changes(fit, experiments, model, moved, memory, step)
-    return columns, further
-
-
-def _changes(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    model: Model,
-    moved: Mapping[str, float],
-    memory: tuple[dict[str, float], ...],
-    step: float,
     others: _Beside | None = None,
-) -> tuple[FloatArray, tuple[FloatArray, ...], float]:
-    """Return the same with the share that they may err by, where `others` has the effect's law."""
+) -> tuple[tuple[FloatArray, ...], float]:
+    """Return what parameters change in every channel's fitted samples (samples, m).
+
+    In its unit, over the records' shares of the noise, beyond offsets and factors. They are `moved`
+    along their derivatives, by their sizes, or the one by a finite `step`. With it comes the share
+    that they may err by, where `others` has the effect's law.
+    """
     stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
     rtol = fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
@@ -446,7 +428,7 @@ def _changes(
             else:
                 parts.append(total / e.share(f.number))
         columns.append(f.left_of(np.concatenate(parts)))
-    return columns[0], tuple(columns[1:]), max(a.error for a in every)
+    return tuple(columns), max(a.error for a in every)
 
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:
@@ -464,16 +446,15 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
     values = {**first.values, **dict.fromkeys(first.effect.linear, 0.0)}
     for d, gain in zip(directions, gains, strict=True):
         values[d.weight] = float(gain) * d.values[d.weight]
-    every = zip(*(d.further for d in directions), strict=True)
+    every = zip(*(d.columns for d in directions), strict=True)
     return Direction(
         first.effect,
         values,
         first.memory,
         1.0,
-        np.column_stack([d.column for d in directions]) @ gains,
+        tuple(np.column_stack(columns) @ gains for columns in every),
         one_sided=False,
         finite=False,
-        further=tuple(np.column_stack(columns) @ gains for columns in every),
     )
 
 

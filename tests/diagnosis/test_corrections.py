@@ -9,7 +9,7 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
-from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
+from psa_casadi.diagnosis.held_out import Compared, Removed, held_out_rms
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
@@ -83,8 +83,8 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
     patch = best_of(observed, experiments, [_held(result, experiments)], colour)
     assert patch is not None
     assert hidden in (patch.name, *patch.open_to)
-    removed = removed_from(experiments, base, [NOISE])
-    spent = budget(removed, base, [], (patch.name, patch.predicted))
+    removed = Removed(experiments, base, [NOISE])
+    spent = removed.budget(base, [], (patch.name, patch.predicted))
     assert spent.unnamed is not None
     assert spent.unnamed.share > 0.7
     assert spent.unnamed.interval[0] > 0.0
@@ -142,8 +142,8 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
     without = [("one", (truth + one,)), ("other", (truth + other,))]
     base, extended = (truth + one + other,), (truth,)
-    result = budget(removed_from(experiments, base, [NOISE]), extended, without, None)
-    spent = stack_budget(result, experiments, base, extended, NOISE)
+    result = Removed(experiments, base, [NOISE]).budget(extended, without, None)
+    spent = Compared(experiments, base, extended).in_lengths(result, NOISE)
     assert spent.excess_rms_m == pytest.approx(5.0 * NOISE, rel=0.05)
     assert [s.share for s in spent.causes] == pytest.approx([9 / 25, 16 / 25], abs=0.04)
     assert spent.together.share == pytest.approx(1.0, abs=0.02)

@@ -94,8 +94,7 @@ def at_port(
         result = law(s, lambda short: getattr(s, f"{name}_{short}"))
         der, term = result if isinstance(result, tuple) else ({}, result)
         return Equations(
-            der={f"{name}_{short}": rate for short, rate in der.items()},
-            add={port.balance: term},
+            der={f"{name}_{short}": rate for short, rate in der.items()}, add={port.balance: term}
         )
 
     description, source, text, looks = words

@@ -158,9 +158,7 @@ _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
 
 def with_cause(
-    before: Hypothesis,
-    scores: Sequence[Score],
-    goal: float = np.inf,
+    before: Hypothesis, scores: Sequence[Score], goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit quickly with one more cause from its best directions; None if every fit fails.
 
@@ -259,10 +257,7 @@ def in_place(
 
 
 def like(
-    whole: Hypothesis,
-    less: Hypothesis,
-    copy: Copy,
-    goal: float = np.inf,
+    whole: Hypothesis, less: Hypothesis, copy: Copy, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
 
@@ -295,9 +290,7 @@ def exchanged(
 
 
 def without(
-    whole: Hypothesis,
-    cause: Component,
-    known: Hypothesis | None = None,
+    whole: Hypothesis, cause: Component, known: Hypothesis | None = None
 ) -> Hypothesis | None:
     """Fit without a cause from where the whole has led; None where that cannot be simulated.
 
@@ -396,10 +389,7 @@ def refit_at_bound(of: Hypothesis) -> Hypothesis | None:
 
 
 def _from_ordinary(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    effect: Component,
-    known: Mapping[str, float],
+    before: Fit, experiments: Sequence[Experiment], effect: Component, known: Mapping[str, float]
 ) -> list[Fit]:
     """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
     gain, size = _parameter(effect, effect.gain), _typical(before, effect)

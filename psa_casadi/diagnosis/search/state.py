@@ -326,7 +326,7 @@ class SearchState:
         """Whether structure remains and the causes explain less than most of the excess."""
         colour = self.view(h).screening.colour
         floor = noise_rms(h.fit.residuals, colour)
-        excess = excess_power(self.base.residuals, colour, floor)
+        excess = excess_power(self.base.residuals, floor)
         explained = self.base.rms**2 - h.fit.rms**2
         return self.view(h).test.alarm and explained < _EXPLAINED * excess
 
