@@ -31,7 +31,7 @@ import numpy as np
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis import views
+from psa_casadi.diagnosis import misfit
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.component import SPECTRAL_PEAKS, Component
 from psa_casadi.model.compose import Model
@@ -89,7 +89,7 @@ class Signature:
     voltage: FloatArray
     base: FloatArray
     changed: FloatArray
-    telling: views.View
+    telling: misfit.View
     coordinate: FloatArray
     counted: FloatArray
 
@@ -194,7 +194,7 @@ def _plays(base: Model, extended: Model, effect: Component) -> Iterator[_Play]:
             yield _Play(size, time, voltage, fitted, y, warming)
 
 
-def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, FloatArray]:
+def _telling(effect: Component, play: _Play) -> tuple[misfit.View, FloatArray, FloatArray]:
     """Return the view that explains most of the difference, its coordinate, and what it counts."""
     d = play.changed - play.base
     if SPECTRAL_PEAKS in effect.probe.values():
@@ -202,23 +202,23 @@ def _telling(effect: Component, play: _Play) -> tuple[views.View, FloatArray, Fl
     record = Record(
         name="signature", time=play.time, voltage=play.voltage, displacement=play.changed
     )
-    rows = [views.time_axis(record), *views.axes(record, play.base, views.drive_of(record))]
+    rows = [misfit.time_axis(record), *misfit.axes(record, play.base, misfit.drive_of(record))]
     # two amplitudes at two rates make no curve
     rows = [row for row in rows if not row.name.startswith(("amplitude", "frequency"))]
     if play.warming is not None:
-        rows = [views.Axis("temperature", "K", play.warming)]
+        rows = [misfit.Axis("temperature", "K", play.warming)]
     signatures = [_view(axis, d) for axis in rows]
     if any(s.memory and s.settles for s in effect.states):
-        axis, _ = views.hold_axis(record)
+        axis, _ = misfit.hold_axis(record)
         signatures.append(_view(axis, _since_it_began(axis.x, d)))
 
-    def weight(row: tuple[views.View, FloatArray, FloatArray]) -> float:
+    def weight(row: tuple[misfit.View, FloatArray, FloatArray]) -> float:
         return row[0].share * (_RATHER if row[0].name == "time" else 1.0)
 
     return max(signatures, key=weight)
 
 
-def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, FloatArray]:
+def _view(axis: misfit.Axis, d: FloatArray) -> tuple[misfit.View, FloatArray, FloatArray]:
     """Return the binned means of a difference along an axis, with the share they explain.
 
     No part is left out for judging, as in a measured record: this one has no noise but 2 %, and no
@@ -227,7 +227,7 @@ def _view(axis: views.Axis, d: FloatArray) -> tuple[views.View, FloatArray, Floa
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    seen = views.view(views.ground_of(residual, noise), axis)
+    seen = misfit.view(misfit.ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
@@ -252,7 +252,7 @@ def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
     return moved
 
 
-def _spectrum(time: FloatArray, d: FloatArray) -> views.View:
+def _spectrum(time: FloatArray, d: FloatArray) -> misfit.View:
     """Return the amplitude density; its share is that of the band around the highest peak."""
     step = float(time[-1]) / (time.size - 1)
     window = np.hanning(d.size)
@@ -264,7 +264,7 @@ def _spectrum(time: FloatArray, d: FloatArray) -> views.View:
     drawn = (frequency > 0) & (frequency < 20.0 * peak)
     density = np.sqrt(2.0 * step * power / float(window @ window))[drawn]
     none = np.zeros(density.size)
-    return views.View("spectrum", "Hz", frequency[drawn], density, none, share, True)
+    return misfit.View("spectrum", "Hz", frequency[drawn], density, none, share, True)
 
 
 #: When a hold is looked at [s] after its step, and how long the step takes [s].
