@@ -26,7 +26,7 @@ from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray, per
 from psa_casadi.diagnosis import screening
 from psa_casadi.diagnosis.corrections import FreeFunction, estimates
-from psa_casadi.diagnosis.generic.of_signals import LARGEST, ORDINARY, Attached, extended, size_at
+from psa_casadi.diagnosis.generic import LARGEST, ORDINARY, Attached, extended, size_at
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.probes import changes, tangents
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis

@@ -22,7 +22,7 @@ from psa_casadi.diagnosis.corrections import (
     place_and_kind,
 )
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
-from psa_casadi.diagnosis.generic.of_signals import Attached
+from psa_casadi.diagnosis.generic import Attached
 from psa_casadi.diagnosis.held_out import Budget, Removed, Share, held_out_within, too_few_held_out
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes

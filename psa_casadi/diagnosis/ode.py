@@ -12,8 +12,7 @@ import numpy as np
 from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.common.notes import Note, note
 from psa_casadi.diagnosis.free_functions import model_of
-from psa_casadi.diagnosis.generic.of_rates import effects_of
-from psa_casadi.diagnosis.generic.of_signals import Attached, of_ones_own
+from psa_casadi.diagnosis.generic import Attached, effects_of, of_ones_own
 from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted

@@ -29,8 +29,7 @@ from psa_casadi.design.experiment.experiment import (
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
 from psa_casadi.design.experiment.search import Effort
-from psa_casadi.diagnosis.generic.of_rates import effects_of
-from psa_casadi.diagnosis.generic.of_signals import Attached, extended, of_ones_own
+from psa_casadi.diagnosis.generic import Attached, effects_of, extended, of_ones_own
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.search.state import fit_contenders, fitted_rivals
