@@ -162,10 +162,6 @@ def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
     return z
 
 
-def _flat(count: int) -> FloatArray:
-    return np.ones(count)
-
-
 def _smooth(count: int) -> FloatArray:
     return 1.0 / np.arange(1, count + 1)
 
@@ -177,9 +173,9 @@ KINDS = (
     Form("curve", "force",
          lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, patches.CURVE)), _smooth, True),
     Form("direction", "force", _direction, _smooth),
-    Form("memory", "force", _memory, _flat),
-    Form("relaxation", "force", _relaxation, _flat),
-    Form("modes", "force", _modes, _flat),
+    Form("memory", "force", _memory, np.ones),
+    Form("relaxation", "force", _relaxation, np.ones),
+    Form("modes", "force", _modes, np.ones),
     Form("time", "reading", _time, _smooth),
     Form("gain in time", "force",
          lambda s, k: s.displacement(k)[:, None] * _time(s, k), _smooth),

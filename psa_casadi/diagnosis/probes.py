@@ -447,14 +447,9 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
     for d, gain in zip(directions, gains, strict=True):
         values[d.weight] = float(gain) * d.values[d.weight]
     every = zip(*(d.columns for d in directions), strict=True)
+    columns = tuple(np.column_stack(each) @ gains for each in every)
     return Direction(
-        first.effect,
-        values,
-        first.memory,
-        1.0,
-        tuple(np.column_stack(columns) @ gains for columns in every),
-        one_sided=False,
-        finite=False,
+        first.effect, values, first.memory, 1.0, columns, one_sided=False, finite=False
     )
 
 

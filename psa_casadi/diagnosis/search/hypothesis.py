@@ -168,16 +168,9 @@ def hypothesis(
         colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
     return Hypothesis(
-        tuple(causes),
-        fit,
-        experiments,
-        predictions,
-        held_rms,
-        train_rms,
-        whole,
-        tuple(colours),
+        tuple(causes), fit, experiments, predictions, held_rms, train_rms, whole, tuple(colours),
         final,
-    )
+    )  # fmt: skip
 
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:

@@ -18,14 +18,7 @@ from psa_casadi.diagnosis.noise import Omnibus
 from psa_casadi.diagnosis.pack import STACK, Task, is_dynamic
 from psa_casadi.diagnosis.result import Contender
 from psa_casadi.diagnosis.screening import Screening, credible_set, levelled, probabilities
-from psa_casadi.diagnosis.search.fits import (
-    as_led,
-    cost_beside,
-    refit_at_bound,
-    to_end,
-    with_cause,
-    without,
-)
+from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
@@ -165,12 +158,16 @@ class SearchState:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted to one, best first."""
-        children = []
-        for name in self.fitted.get(h.names, ()):
-            if (child := self.hypotheses.get(h.names | {name})) is not None:
-                added = [c for c in child.causes if c.name not in h.names]
-                children.append(replace(child, causes=(*h.causes, *added)))
+        children = [
+            replace(c, causes=(*h.causes, *(a for a in c.causes if a.name not in h.names)))
+            for c in self.fitted_with(h).values()
+        ]
         return sorted(children, key=lambda c: -self.scale.evidence(c))
+
+    def fitted_with(self, h: Hypothesis) -> dict[str, Hypothesis]:
+        """Return the hypotheses with one more effect, by its name."""
+        every = {n: self.hypotheses.get(h.names | {n}) for n in self.fitted.get(h.names, ())}
+        return {n: child for n, child in every.items() if child is not None}
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
@@ -184,7 +181,7 @@ class SearchState:
 
         Its evidence with `h` would be below `SHARE` of that one's, and by `NEAR` nats.
         """
-        count, reached = len(h.fit.residuals), cost_beside(best, h)
+        count, reached = len(h.fit.residuals), fits.cost_beside(best, h)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
         return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
@@ -223,12 +220,12 @@ class SearchState:
         if "begun again" in self.task.method.without:
             return
         final = [self.hypotheses[h.names] for h in hypotheses]
-        for again in side_by_side(refit_at_bound, final):
+        for again in side_by_side(fits.refit_at_bound, final):
             self.note(again)
 
     def _to_end(self, h: Hypothesis) -> Hypothesis:
         """Fit a hypothesis to its end, with the noise that it leaves."""
-        ended = to_end(h)
+        ended = fits.to_end(h)
         if self.task.pack.is_stack:
             return ended
         levelled, _ = relevelled(ended.fit, h.experiments, every=True)
@@ -268,7 +265,7 @@ class SearchState:
         if (h, before) not in self.noises:
             result = self.exceeds(h, before)
             if result and before.colours[0].autoregression.size:
-                led = as_led(h, cause)
+                led = fits.as_led(h, cause)
                 result = led is None or self.exceeds(h, led)
             self.noises[h, before] = result
         return self.noises[h, before]
@@ -409,7 +406,7 @@ def _way(known: SearchState, count: int) -> Hypothesis:
     if fitted is not None:
         return replace(fitted, causes=best.causes[:count])
     for cause in best.causes[: count - 1 : -1]:
-        less = without(best, cause)
+        less = fits.without(best, cause)
         best = best if less is None else less
     return best
 
@@ -423,32 +420,23 @@ def _view(known: SearchState, h: Hypothesis) -> View:
 
 
 def _step(known: SearchState, view: View, chosen: Hypothesis | None) -> Step:
-    fitted, gain, task = _fitted(known, view.of), known.scale.gain, known.task
+    scale, among, refused = known.scale, known.fitted_with(view.of), set[str]()
     if chosen is not None:
-        fitted[chosen.causes[-1].name] = chosen
-    evidence = known.scale.evidence(view.of)
-    alone = {**view.estimated(), **{n: gain(c, view.of) for n, c in fitted.items()}}
+        among[chosen.causes[-1].name] = chosen
+    alone = {**view.estimated(), **{n: scale.gain(h, view.of) for n, h in among.items()}}
+    step, evidence, whole = Step(view, among, chosen, alone=alone), alone, scale.evidence(view.of)
     if chosen is None:
-        refused = {n for n, c in fitted.items() if c.names not in known.admissible}
-        return _judged(Step(view, fitted, alone=alone), alone, fitted, refused, evidence, task)
-    cause = chosen.causes[-1]
-    less = known.hypotheses.get(known.answer.names - {cause.name}) or without(known.answer, cause)
-    if less is None:  # it cannot be fitted; the effects as they are without the later causes
-        return _judged(
-            Step(view, fitted, chosen, alone=alone), alone, fitted, set(), evidence, task
-        )
-    there = _view(known, less)
-    instead = {**_fitted(known, less), cause.name: known.answer}
-    beside = {**there.estimated(), **{n: gain(c, less) for n, c in instead.items()}}
-    refused = {n for n, c in instead.items() if c.names not in known.admissible} - {cause.name}
-    step = Step(view, fitted, chosen, less, there, instead, alone)
-    return _judged(step, beside, instead, refused, known.scale.evidence(known.answer), task)
-
-
-def _fitted(known: SearchState, h: Hypothesis) -> dict[str, Hypothesis]:
-    """Return the hypotheses with one more effect, by its name."""
-    every = {n: known.hypotheses.get(h.names | {n}) for n in known.fitted.get(h.names, ())}
-    return {n: child for n, child in every.items() if child is not None}
+        refused = {n for n, h in among.items() if h.names not in known.admissible}
+        return _judged(step, evidence, among, refused, whole, known.task)
+    cause, answer = chosen.causes[-1], known.answer
+    less = known.hypotheses.get(answer.names - {cause.name}) or fits.without(answer, cause)
+    if less is not None:  # else it cannot be fitted; the effects are without the later causes
+        there, among = _view(known, less), {**known.fitted_with(less), cause.name: answer}
+        evidence = {**there.estimated(), **{n: scale.gain(h, less) for n, h in among.items()}}
+        refused = {n for n, h in among.items() if h.names not in known.admissible} - {cause.name}
+        step = replace(step, without=less, view_without=there, instead=among)
+        whole = scale.evidence(answer)
+    return _judged(step, evidence, among, refused, whole, known.task)
 
 
 def _judged(
@@ -492,9 +480,9 @@ def contenders(step: Step, limits: Thresholds, names: Sequence[str] = ()) -> tup
     known = dict(step.evidence)
     for name in names:
         scores = [] if name in result else step.view.starts_of(name)
-        fitted = with_cause(step.view.of, scores) if scores else None
+        fitted = fits.with_cause(step.view.of, scores) if scores else None
         if fitted is not None:
-            result[name] = to_end(fitted)
+            result[name] = fits.to_end(fitted)
             known[name] = scale.gain(result[name], step.view.of)
     return tuple(Contender(n, result[n].fit, known[n]) for n in names if n in result)
 
