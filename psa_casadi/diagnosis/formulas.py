@@ -25,7 +25,7 @@ from psa_casadi.diagnosis.generic.attached import LARGEST, ORDINARY, size_at
 from psa_casadi.diagnosis.probes import tangents
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, hypothesis
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.refitting import refit, weighted
+from psa_casadi.identification.refitting import refit
 from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Port, true_sum, unit_of, variables_at
@@ -229,9 +229,8 @@ def fitted(
     kept = {n: v for n, v in values.items() if n in of.fit.model.values}
     model = of.fit.model.with_values(kept).with_effect(component, start)
     fit = refit(
-        replace(begin, model=model), weighted(of.fit, of.experiments),
-        [*of.fit.unknowns.names, *component.fitted],
-        sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
+        replace(begin, model=model), [*of.fit.unknowns.names, *component.fitted],
+        others=of.experiments, sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
     )  # fmt: skip
     result = hypothesis((*of.causes, component), fit, of.experiments)
     return None if result is None else Formula(result, component, tuple(terms))

@@ -52,7 +52,7 @@ def model_of(
     """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    sure, inputs = determinacy(fit, experiments), [e.record for e in experiments]
+    sure, inputs = determinacy(fit), [e.record for e in experiments]
     return with_origin(
         model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
@@ -111,8 +111,8 @@ def formula_of(
     model = function.model
     if len(whole) < len(of.experiments):
         with suppress(PsaError):
-            fit = fit_longer_parts(result.hypothesis.fit, of.experiments, whole)
-            if follows(fit, whole):
+            fit = fit_longer_parts(result.hypothesis.fit, whole)
+            if follows(fit):
                 model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
     equation = result.equation(port.balance, model.values)
     parameters = estimates(result.component, model)
@@ -160,7 +160,7 @@ def _along(
     fit: Fit, experiments: Sequence[Experiment], expressions: Sequence[Expression]
 ) -> FloatArray:
     """Return expressions in a model's symbols along all records (expressions, n)."""
-    model, theta, result = fit.model, fit.placed(experiments), []
+    model, theta, result = fit.model, fit.placed(), []
     s, p = model.structure, model.parameter_vector()
     sums = ca.vertcat(*(s.symbols[n] for n in s.sums)), ca.vertcat(*s.sums.values())
     f = ca.Function("along", s.arguments, [ca.substitute(ca.vertcat(*expressions), *sums)])
