@@ -140,8 +140,8 @@ def _finish(
             _save(identification.model, output)
             done.append(output)
         names = () if identification.interrupted else identification.determinacy.names
-        fit, experiments = identification.fit, identification.experiments
-        profiles = [profile(fit, experiments, n, progress=progress) for n in wanted if n in names]
+        fit = identification.fit
+        profiles = [profile(fit, n, progress=progress) for n in wanted if n in names]
         if json is not None:
             atomic_write(json, json_text(identification_file(identification, profiles)))
             done.append(json)

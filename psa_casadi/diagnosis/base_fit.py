@@ -265,10 +265,10 @@ def instead_of(
         return _tuned(rung, experiments, progress)
     if not shows_ringing(experiments):
         return None
-    again = retuned(base, experiments, progress, reached=fit.rms)
+    again = retuned(base, progress, reached=fit.rms)
     if _short(base, again) <= _CLEAR:
         return None
-    return without_blur(again, experiments) if _short(again, fit) < _LIKE else None
+    return without_blur(again) if _short(again, fit) < _LIKE else None
 
 
 def rings(effect: Component) -> bool:
@@ -280,8 +280,8 @@ def _tuned(fit: Fit, experiments: Sequence[Experiment], progress: Progress) -> F
     """Return the fit with its mechanics sought again while it rings; k_P is free if determined."""
     left = ringing(fit, experiments)
     if left is None or left.decrease >= SEEN:
-        fit = retuned(fit, experiments, progress)
-    return without_blur(fit, experiments)
+        fit = retuned(fit, progress)
+    return without_blur(fit)
 
 
 def _short(fit: Fit, other: Fit) -> float:
@@ -344,13 +344,13 @@ def _with_masses(
     def fit_from(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
         return quick_from(
-            before, before.model, experiments, free,
+            before, before.model, free,
             start_states=before.starts(), evaluations=_FIRST, start=start,
         )  # fmt: skip
 
     def further(quick: Fit) -> Fit | None:
         return quick_from(
-            quick, quick.model, experiments, quick.unknowns.names,
+            quick, quick.model, quick.unknowns.names,
             start_states=quick.starts(), evaluations=_QUICK,
         )  # fmt: skip
 
@@ -361,7 +361,7 @@ def _with_masses(
     if best is None:
         return None
     try:
-        final = refit(best, experiments, best.unknowns.names, least=least)
+        final = refit(best, least=least)
     except PsaError:
         return None
     return final if _short(before, final) > _CLEAR else None

@@ -207,7 +207,7 @@ def noise_told(
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
-    weighted, levels = with_noise(fit, experiments), []
+    weighted, levels = with_noise(fit), []
     for o, c in zip(fit.channels, colour.each, strict=True):
         j = o.number
         rows = zip(o.records, o.parts, strict=True)

@@ -345,7 +345,7 @@ def best_of(
 def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> tuple[Patch, ...]:
     """Return all corrections of a fit, the one of the highest evidence first."""
     try:
-        full = fit.predictions(experiments)
+        full = fit.predictions()
         signals = Signals(experiments, [p.displacement for p in full], responses(fit, experiments))
     except PsaError:
         return ()

@@ -108,7 +108,7 @@ def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
     where the voltage itself is hardly more than that.
     """
     left = total = 0.0
-    for e, y in zip(experiments, base.predicted(experiments), strict=True):
+    for e, y in zip(experiments, base.predicted(), strict=True):
         inputs = measured(e.record)
         valid = np.isfinite(inputs)
         time, v = e.record.time[valid], e.record.voltage[valid]
@@ -310,7 +310,7 @@ def diagnose(
             result = _against(since, start, task, scale_given)
         noise: tuple[NoiseFound, ...] = ()
         if result.verdict != "not_driven":
-            noise = noise_found(result.extended_fit, result.experiments, (*whole, *held))
+            noise = noise_found(result.extended_fit, (*whole, *held))
         return result.with_noise(noise, notes)
     except KeyboardInterrupt:
         if not so_far:
@@ -436,7 +436,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
 
 def _on_even_clock(base: Fit, start: Model, task: Task, notes: list[Note]) -> tuple[Fit, Task]:
     """Fit the base to samples at even times where the data say that the stamps jitter."""
-    even = None if "one clock" in task.method.without else even_clock(base, task.experiments)
+    even = None if "one clock" in task.method.without else even_clock(base)
     if even is not None:
         again, other = _base(start, replace(task, experiments=even[0]))
         if again.rms < base.rms:
@@ -451,7 +451,7 @@ def _between_samples(
     """Search again with a voltage that is smooth between samples where the data say so."""
     between = None
     if "between samples" not in task.method.without:
-        between = smooth_between(steps[0].fit, task.experiments)
+        between = smooth_between(steps[0].fit)
     if between is not None:
         again, other = _searched(start, replace(task, experiments=between[0]))
         if again[0].fit.rms < steps[0].fit.rms:
@@ -469,11 +469,11 @@ def _base(start: Model, task: Task) -> tuple[Fit, Task]:
         base = fit_base(start, task.experiments, progress=task.progress)
     else:
         base = fit(start, task.experiments, task.free, sigma=noise_levels(task.experiments))
-    base, experiments = relevelled(base, task.experiments)
+    base = relevelled(base)
     task.keep(base)
     if base.interrupted:
         raise KeyboardInterrupt
-    return base, replace(task, experiments=experiments)
+    return base, replace(task, experiments=base.experiments)
 
 
 def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:

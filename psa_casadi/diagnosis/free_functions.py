@@ -33,7 +33,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypo
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.parts import fit_longer_parts, follows
-from psa_casadi.identification.refitting import refit, weighted
+from psa_casadi.identification.refitting import refit
 from psa_casadi.identification.result import with_origin
 from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model
@@ -240,9 +240,8 @@ def fitted(
     kept = {n: v for n, v in values.items() if n in of.fit.model.values}
     model = of.fit.model.with_values(kept).with_effect(component, start)
     fit = refit(
-        replace(begin, model=model), weighted(of.fit, of.experiments),
-        [*of.fit.unknowns.names, *component.fitted],
-        sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
+        replace(begin, model=model), [*of.fit.unknowns.names, *component.fitted],
+        others=of.experiments, sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
     )  # fmt: skip
     result = hypothesis((*of.causes, component), fit, of.experiments)
     return None if result is None else Formula(result, component, tuple(terms))
@@ -367,7 +366,7 @@ def model_of(
     """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    sure, inputs = determinacy(fit, experiments), [e.record for e in experiments]
+    sure, inputs = determinacy(fit), [e.record for e in experiments]
     return with_origin(
         model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
@@ -426,8 +425,8 @@ def formula_of(
     model = function.model
     if len(whole) < len(of.experiments):
         with suppress(PsaError):
-            fit = fit_longer_parts(result.hypothesis.fit, of.experiments, whole)
-            if follows(fit, whole):
+            fit = fit_longer_parts(result.hypothesis.fit, whole)
+            if follows(fit):
                 model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
     equation = result.equation(port.balance, model.values)
     parameters = estimates(result.component, model)
@@ -475,7 +474,7 @@ def _along(
     fit: Fit, experiments: Sequence[Experiment], expressions: Sequence[Expression]
 ) -> FloatArray:
     """Return expressions in a model's symbols along all records (expressions, n)."""
-    model, theta, result = fit.model, fit.placed(experiments), []
+    model, theta, result = fit.model, fit.placed(), []
     s, p = model.structure, model.parameter_vector()
     sums = ca.vertcat(*(s.symbols[n] for n in s.sums)), ca.vertcat(*s.sums.values())
     f = ca.Function("along", s.arguments, [ca.substitute(ca.vertcat(*expressions), *sums)])

@@ -522,7 +522,7 @@ class ModelJudge(Judge):
     @cached_property
     def extended(self) -> tuple[FloatArray, ...]:
         """What the extended model shows of every output along every record (n, ny)."""
-        return tuple(self.final.fit.outputs(self.experiments))
+        return tuple(self.final.fit.outputs())
 
     def _changes(self, effects: Sequence[Component]) -> tuple[Size, ...]:
         return changes(effects, self.final.fit, self.experiments, self.extended)
@@ -588,7 +588,7 @@ class ModelJudge(Judge):
             rms = [missed_rms(self.experiments, p, o.number) for p in both]
             errors.append(OutputError(o.column, o.channel.unit, level, *rms))
         extended = self.extended
-        base = tuple(first.fit.outputs(self.experiments)) if self.kept else extended
+        base = tuple(first.fit.outputs()) if self.kept else extended
         return Diagnosis(
             errors=tuple(errors), remarks=self.remarks, experiments=experiments, base=base,
             extended=extended, **self.common,

@@ -291,7 +291,7 @@ def detection_limit_of(fit: Fit, experiments: Sequence[Experiment], limits: Thre
     """Return the rms [m] below which the residuals of a fit are uninformative of a stack."""
     error = max((s.errors[0] for s in fit.simulated if s.errors), default=0.0)
     counts = [int(e.used.sum()) for e in experiments]
-    pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+    pairs = zip(experiments, fit.record_residuals, strict=True)
     squares = [detection_limit(e.record, error, part, limits) ** 2 for e, part in pairs]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
@@ -366,7 +366,7 @@ def without_stuck_readings(
     the record alone cannot separate from a stack that is late, the sensor was stuck.
     """
     kept, count = [], 0
-    for e, predicted in zip(experiments, fit.predicted(experiments), strict=True):
+    for e, predicted in zip(experiments, fit.predicted(), strict=True):
         y = measured(e.record)
         residual = np.abs(y - predicted)
         again = np.r_[False, np.diff(y) == 0.0]

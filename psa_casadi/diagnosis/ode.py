@@ -100,7 +100,7 @@ def diagnose_ode(
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
-    for base, runs, _, choices in ways(
+    for base, _, choices in ways(
         model,
         inputs,
         made,
@@ -111,6 +111,7 @@ def diagnose_ode(
     ):
         if base.interrupted:
             raise KeyboardInterrupt
+        runs = base.experiments
         table = _table(base, runs, effects, leave_out, of_zeros)
         way = _Way(base, runs, choices, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
@@ -119,7 +120,7 @@ def diagnose_ode(
             break
     with way.kept_at_interrupt():
         answer = judge.conclude()
-    noise = noise_found(answer.extended_fit, answer.experiments, (*inputs, *held))
+    noise = noise_found(answer.extended_fit, (*inputs, *held))
     codes = {n.code for n in notes}
     remarks = (
         *(n for n in way.notes if n.code not in codes),
@@ -241,9 +242,9 @@ def _better(new: ModelJudge, old: ModelJudge) -> bool:
 def _settled(judge: ModelJudge) -> bool:
     """Whether parts of records would show no more than a search in them."""
     if judge.verdict not in _OPEN:
-        return settled(judge.final.fit, judge.experiments)
-    best = judge.last.fit, judge.experiments
-    return forgets(*best) and (bool(judge.kept) or follows(*best, NEAR))
+        return settled(judge.final.fit)
+    best = judge.last.fit
+    return forgets(best) and (bool(judge.kept) or follows(best, NEAR))
 
 
 def _coloured(judge: ModelJudge) -> bool:
@@ -264,7 +265,7 @@ def _search(
     (`hold_known`).
     """
     known = _once(base, experiments, task_of)
-    noise = with_noise(known.answer.fit, experiments)
+    noise = with_noise(known.answer.fit)
     if unlike(noise, experiments):
         known.task.progress("searching again, noise by record")
         known = _once(reweighted(base, noise), noise, task_of)
@@ -292,7 +293,7 @@ def _held_instead(
     step = float(np.median([e.record.sample_time for e in runs]))
     times = [best.fit.model.values[f"{c.name}_time"] for c in best.causes if c.name in _late(base)]
     late = hold == "zero" and any(_HALF[0] < t / step < _HALF[1] for t in times)
-    if not late and not held_otherwise(best.fit, runs):
+    if not late and not held_otherwise(best.fit):
         return None
     others = held_as(runs, hold)
     try:
@@ -315,17 +316,17 @@ def _of_whole(known: SearchState, task: Task) -> SearchState | None:
 
     None where the result does not follow these.
     """
-    best, parts = known.answer, known.task.experiments
+    best = known.answer
     task.progress("fitting the whole records")
     try:
-        top = fit_longer_parts(best.fit, parts, task.experiments)
-        if not best.causes or not follows(top, task.experiments):
+        top = fit_longer_parts(best.fit, task.experiments)
+        if not best.causes or not follows(top):
             return None
-        base = fit_longer_parts(known.root.fit, parts, task.experiments)
-        result = SearchState(levelled(base, task.experiments)[0], task)
+        base = fit_longer_parts(known.root.fit, task.experiments)
+        result = SearchState(levelled(base), task)
         for h in (h for h in known.hypotheses.values() if h.causes and h.final):
             with suppress(PsaError):
-                fit = top if h is best else fit_longer_parts(h.fit, parts, task.experiments)
+                fit = top if h is best else fit_longer_parts(h.fit, task.experiments)
                 result.note(hypothesis(h.causes, fit, task.experiments, final=True))
         result.conclude()
     except PsaError:

@@ -115,7 +115,7 @@ def _binned(
     mean.
     """
     parts = []
-    for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
+    for k, (e, residual) in enumerate(zip(experiments, fit.record_residuals, strict=True)):
         if e.held_out_whole:
             continue
         reading = measured(e.record)[: e.stop][e.used[: e.stop]]

@@ -96,7 +96,7 @@ class Healthy:
     @cached_property
     def residuals(self) -> list[FloatArray]:
         """Measured minus predicted of every record (n,) [m], about its mean, nan where none."""
-        pairs = zip(self.experiments, self.fit.predicted(self.experiments), strict=True)
+        pairs = zip(self.experiments, self.fit.predicted(), strict=True)
         left = [np.where(e.used, measured(e.record) - y, np.nan) for e, y in pairs]
         return [r - np.nanmean(r) for r in left]
 

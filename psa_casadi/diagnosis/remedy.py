@@ -512,7 +512,7 @@ def changes(
     columns = [fit.model.output_names.index(o.channel.outputs[0]) for o in fit.channels]
     without = fit.at({e.gain: 0.0 for e in effects if e.gain})
     try:
-        pairs = zip(arrays, without.outputs(experiments), strict=True)
+        pairs = zip(arrays, without.outputs(), strict=True)
         most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)
     except PsaError:
         return ()

@@ -135,9 +135,9 @@ def diagnosed_model(
     spent: held_out.StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with its evidence; `spent` is its error's budget."""
-    result = determinacy(fit, experiments)
+    result = determinacy(fit)
     evidence = replace(
-        evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
+        evidence_of(fit, result, predicted, by="psa diagnose"),
         held_out=_held_out(experiments, predicted),
         budget=None
         if spent is None
@@ -359,4 +359,4 @@ def patched_model(d: Diagnosis) -> Model:
         raise InputError("No unnamed correction removes more than the extended model does.")
     fit = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
     inputs = d.model.provenance.force_scale == "given"
-    return diagnosed_model(fit, d.experiments, fit.predicted(d.experiments), inputs)
+    return diagnosed_model(fit, d.experiments, fit.predicted(), inputs)

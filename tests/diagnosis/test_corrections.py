@@ -32,7 +32,7 @@ def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
 
 
 def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
-    return held_out_rms(experiments, found.predicted(experiments))
+    return held_out_rms(experiments, found.predicted())
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
     y = _measured(clean, HIDDEN[hidden](clean))
     result, experiments, colour = _fitted(y)
     observed = corrections(result, experiments, colour)
-    base = (np.asarray(result.predicted(experiments)[0]),)
+    base = (np.asarray(result.predicted()[0]),)
     patch = best_of(observed, experiments, [_held(result, experiments)], colour)
     assert patch is not None
     assert hidden in (patch.name, *patch.open_to)
@@ -94,7 +94,7 @@ def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> 
 def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatArray) -> None:
     """In the model it does what the linear estimate promises; the file reads back the same."""
     result, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))
-    predicted = result.predicted(experiments)
+    predicted = result.predicted()
     held = held_out_rms(experiments, predicted)
     kind, port = hidden.split(" at the ")
     items = [c for c in corrections(result, experiments, colour) if c.kind == kind]
@@ -102,7 +102,7 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
     patch = best_of(items, experiments, [held], colour)
     assert isinstance(patch, Patch)
     again = with_patch(result, patch, experiments, predicted)
-    after = held_out_rms(experiments, again.predicted(experiments))
+    after = held_out_rms(experiments, again.predicted())
     assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
     model = loads(dumps(again.model))
     assert model.values == again.model.values
@@ -116,7 +116,7 @@ def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
     with pytest.raises(InputError, match="no form that a model could hold"):
-        with_patch(result, patch, experiments, result.predicted(experiments))
+        with_patch(result, patch, experiments, result.predicted())
 
 
 def test_noise_gets_no_correction(clean: FloatArray) -> None:

@@ -200,7 +200,8 @@ def rivals_of(
             known_start=known_start,
         )  # fmt: skip
         progress("fitting from several starts")
-        base, runs, _ = search_starts(sized(model, runs), runs, names, starts=8)
+        base, _ = search_starts(sized(model, runs), runs, names, starts=8)
+        runs = base.experiments
         words["outputs"] = tuple(c.column for c in base.channels)
     if not separate:
         if base is None:

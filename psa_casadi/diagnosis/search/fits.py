@@ -138,7 +138,7 @@ def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
 
     Of the displacement and of further columns.
     """
-    parts = [*zip(other.fit.residuals_of(of.experiments), of.fit.sigma, strict=True)]
+    parts = [*zip(other.fit.record_residuals, of.fit.sigma, strict=True)]
     pairs = zip(other.fit.further, of.fit.further, strict=True)
     parts += [(f.residuals, g.level) for f, g in pairs]
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
@@ -305,9 +305,8 @@ def without(
     for share in _SHARES:
         try:
             start = model.with_values({n: share * model.values[n] for n in gains})
-            parts = weighted(whole.fit, whole.experiments)
             sigma = None if is_stack(start) else whole.fit.sigma
-            result = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
+            result = refit(replace(whole.fit, model=start), names, sigma=sigma, least=least)
         except PsaError:
             continue
         return hypothesis(causes, result, whole.experiments, final=True)
@@ -321,9 +320,9 @@ def as_led(whole: Hypothesis, cause: Component) -> Hypothesis | None:
     """
     model = whole.fit.model.without([cause.name])
     names = [n for n in whole.fit.unknowns.names if n in model.values]
-    start, parts = replace(whole.fit, model=model), weighted(whole.fit, whole.experiments)
+    start = replace(whole.fit, model=model)
     try:
-        result = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
+        result = refit(start, names, sigma=whole.fit.sigma, evaluations=1)
     except PsaError:
         return None
     causes = [c for c in whole.causes if c is not cause]
@@ -333,7 +332,7 @@ def as_led(whole: Hypothesis, cause: Component) -> Hypothesis | None:
 def together(of: Hypothesis) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:
-        result = refit(of.fit, weighted(of.fit, of.experiments), of.fit.unknowns.names)
+        result = refit(of.fit)
     except PsaError:
         return None
     return hypothesis(of.causes, result, of.experiments, final=True)

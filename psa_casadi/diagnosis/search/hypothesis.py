@@ -145,7 +145,7 @@ def hypothesis(
     if fit is None:
         return None
     try:
-        predictions = tuple(fit.predicted_channels(experiments))
+        predictions = tuple(fit.predicted_channels())
     except PsaError:
         return None
     rows, colours = [], []
@@ -383,7 +383,7 @@ def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
     if "remainder" in task.method.without:
         colour = residual_colour(fit.residuals, lengths)
     elif task.pack.is_stack:
-        pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+        pairs = zip(experiments, fit.record_residuals, strict=True)
         known = [known_colour(e.record, r) for e, r in pairs]
     return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
 

@@ -56,7 +56,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             return None
         left = measured(e.record)[part] - before.predicted[k][part]
         shaken.append(Response(e.record.sample_time, drive[part], left, e.used[part]))
-        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
+        free.append(before.fit.jacobian[before.fit.parts[k]][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
     fit, states = before.fit, tuple(before.fit.starts())
     while len(modes) >= FEWEST:

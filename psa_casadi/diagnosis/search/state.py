@@ -228,7 +228,7 @@ class SearchState:
         ended = fits.to_end(h)
         if self.task.pack.is_stack:
             return ended
-        levelled, _ = relevelled(ended.fit, h.experiments, every=True)
+        levelled = relevelled(ended.fit, every=True)
         if levelled is ended.fit:
             return ended
         return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended

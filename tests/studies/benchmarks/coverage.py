@@ -89,7 +89,7 @@ def one_run(name: str, seed: int) -> Run:
     level = NOISE * max(r.range_m for r in clean)
     records = with_noise(clean, NOISE, (tuple(psa.STACKS).index(name), seed))
     result = psa.identify(records, stiffness=truth["k_B"])
-    white = tuple(whiteness(r)[0] > _WHITE for r in result.fit.residuals_of(result.experiments))
+    white = tuple(whiteness(r)[0] > _WHITE for r in result.fit.record_residuals)
     return Run(name, compared(result, truth), result.fit.rms / level, white, result.fit.converged)
 
 
