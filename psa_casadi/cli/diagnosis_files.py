@@ -98,7 +98,7 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    contenders, same = one_of_each(d.contenders, d.experiments)
+    contenders, same = one_of_each(d.contenders)
     if same and len(contenders) < 2:
         return d
     before = d.next_experiment

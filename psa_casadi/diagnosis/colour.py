@@ -200,10 +200,8 @@ def noise_left(fit: Fit, colour: Colour) -> list[float]:
     return [noise_rms(o.residuals, c) for o, c in rows]
 
 
-def noise_told(
-    fit: Fit, colour: Colour, experiments: Sequence[Experiment]
-) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
-    """Return the experiments and every output's noise over them, in its unit, as a fit leaves it.
+def noise_told(fit: Fit, colour: Colour) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
+    """Return a fit's experiments and every output's noise over them, as it leaves it.
 
     What a search has weighted by is from the base's residual, which holds more than noise.
     """
@@ -212,7 +210,7 @@ def noise_told(
         j = o.number
         rows = zip(o.records, o.parts, strict=True)
         left = np.concatenate(
-            [p * (experiments[k].share(j) / weighted[k].share(j)) for k, p in rows]
+            [p * (fit.experiments[k].share(j) / weighted[k].share(j)) for k, p in rows]
         )
         levels.append(noise_rms(left, c) * noise_share(weighted, j))
     return weighted, tuple(levels)
@@ -232,16 +230,14 @@ def rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(valid**2))) if valid.size else 0.0
 
 
-def residual_colour(residual: FloatArray, lengths: Sequence[int]) -> Colour:
+def residual_colour(parts: Sequence[FloatArray]) -> Colour:
     """Return the colour of the residual itself, whatever it holds, one autoregression per record.
 
     A missing effect counts as colour then: a negative control, and what a tone must stand out of
     (`ringing`), but not a way to know the noise.
     """
-    ends = np.cumsum(lengths)
-    parts = np.split(residual, ends[:-1])
-    each = (autoregression_of(part) if part.size else part for part in parts)
-    return _with_level(tuple(each), residual, lengths)
+    each = tuple(autoregression_of(part) if part.size else part for part in parts)
+    return _with_level(each, np.concatenate(parts), [part.size for part in parts])
 
 
 def _with_level(

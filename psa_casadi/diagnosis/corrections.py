@@ -342,14 +342,15 @@ def best_of(
     return replace(best, open_to=tuple(c.name for c in others))
 
 
-def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> tuple[Patch, ...]:
+def corrections(fit: Fit, colour: Colour) -> tuple[Patch, ...]:
     """Return all corrections of a fit, the one of the highest evidence first."""
+    experiments = fit.experiments
     try:
         full = fit.predictions()
         signals = Signals(experiments, [p.displacement for p in full], responses(fit, experiments))
     except PsaError:
         return ()
-    follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
+    follow = _Following(fit, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
     every = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
     return tuple(sorted(every, key=lambda c: -c.evidence))
@@ -358,20 +359,14 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
 class _Following:
     """The model's parameters, which follow a correction as far as prior and bounds let them."""
 
-    def __init__(
-        self,
-        fit: Fit,
-        experiments: Sequence[Experiment],
-        colour: Colour,
-        jacobians: Sequence[FloatArray],
-    ) -> None:
+    def __init__(self, fit: Fit, colour: Colour, jacobians: Sequence[FloatArray]) -> None:
         self.colour, self.whole, self.residuals = colour, jacobians, fit.residuals
         low, high = fit.unknowns.bounds()
         self.free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
         known = np.isfinite(fit.unknowns.prior)
         self.prior = np.where(known, fit.unknowns.prior, 1.0)[self.free]
         self.held = np.diag(known[self.free].astype(np.float64))
-        used = np.vstack([j[e.used] for j, e in zip(jacobians, experiments, strict=True)])
+        used = np.vstack([j[e.used] for j, e in zip(jacobians, fit.experiments, strict=True)])
         scaled = used[:, self.free] * self.prior
         self.white = np.vstack([self.over_noise(scaled), self.held])
         self.basis = independent(self.white)
@@ -472,9 +467,7 @@ def responses(
     return respond
 
 
-def with_patch(
-    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> Fit:
+def with_patch(before: Fit, patch: Patch, predicted: Sequence[FloatArray]) -> Fit:
     """Return a fit with the correction added to the model, started from the correction's weights.
 
     Of two fits, one starts from the model's values as they follow the correction, one from those
@@ -489,7 +482,7 @@ def with_patch(
             f"The unnamed correction ({patch.name}) has no form that a model could hold; the page"
             " shows it, and a further mode of the table is the nearest that can be fitted."
         )
-    numbers = _numbers(before, patch, experiments, predicted)
+    numbers = _numbers(before, patch, predicted)
     names = [patches.weight(k + 1) for k in range(len(patch.weights))]
     values = {**numbers, patches.GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
 
@@ -497,7 +490,7 @@ def with_patch(
         unknowns = before.unknowns
         return fit(
             before.model.with_effect(component, {**values, **unknowns.values(theta)}),
-            experiments,
+            before.experiments,
             [*unknowns.names, *names],
             sigma=before.sigma,
             start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
@@ -513,11 +506,9 @@ def with_patch(
     return min(fits, key=lambda f: f.cost)
 
 
-def _numbers(
-    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> Mapping[str, float]:
+def _numbers(before: Fit, patch: Patch, predicted: Sequence[FloatArray]) -> Mapping[str, float]:
     """Return the parameters that are not fitted: the range, times."""
-    records = [e.record for e in experiments]
+    records = [e.record for e in before.experiments]
     longest = max(r.duration for r in records)
     if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
         every = np.concatenate([r.voltage for r in records])

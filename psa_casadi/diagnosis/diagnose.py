@@ -76,9 +76,9 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     `model` is where the base fit started.
     """
     experiments, progress, limits = task.experiments, task.progress, task.limits
-    if task.fast and explained(base, experiments) < limits.follows:
-        base = from_resonances(base, experiments, progress) or base
-    share = explained(base, experiments)
+    if task.fast and explained(base) < limits.follows:
+        base = from_resonances(base, progress) or base
+    share = explained(base)
     records = [e.record for e in experiments]
     tests = (doubts.doubtful_unit, doubts.doubtful_voltage, doubts.doubtful_time)
     notes = tuple(s for t in (*tests, doubts.doubtful_quantity) if (s := t(records)))
@@ -89,7 +89,7 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     turned = [replace(e, record=r) for e, r in zip(experiments, flipped, strict=True)]
     other, positive = 0.0, max(share, 0.0)
     with suppress(PsaError):
-        other = explained(fit_base(model, turned), turned)
+        other = explained(fit_base(model, turned))
     if other > max(share, limits.follows):
         return Driven(False, (note("flipped", flipped=other, share=positive), *notes))
     if share >= limits.follows:
@@ -101,14 +101,14 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     return Driven(False, (note("not_driven", share=positive), *([quantity] if quantity else [])))
 
 
-def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
+def explained(base: Fit) -> float:
     """Share of the displacements' variance that a fit explains over whole records; 1 is all.
 
     A drift does not count, a parabola over time: a base can make one from its start alone. It does
     where the voltage itself is hardly more than that.
     """
     left = total = 0.0
-    for e, y in zip(experiments, base.predicted(), strict=True):
+    for e, y in zip(base.experiments, base.predicted(), strict=True):
         inputs = measured(e.record)
         valid = np.isfinite(inputs)
         time, v = e.record.time[valid], e.record.voltage[valid]
@@ -290,7 +290,7 @@ def diagnose(
             sound, model=model, stiffness=stiffness, hysteresis=hysteresis, progress=progress
         )
         progress("what the reference leaves open")
-        since = Healthy(known.fit, known.experiments).since([*inputs, *kept])
+        since = Healthy(known.fit).since([*inputs, *kept])
         inputs, kept = since.taken_off(len(inputs))
         method, model = since.method(method), known.model
     so_far: list[Fit] = []
@@ -402,7 +402,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
         experiments = loads_as_curves(start, experiments, progress)
         task = replace(task, table=table, experiments=experiments)
     base, task = _base(start, task)
-    experiments, stuck = without_stuck_readings(task.experiments, base)
+    experiments, stuck = without_stuck_readings(base)
     if stuck:
         doubts.refuse_stuck([e.record for e in experiments])
         base, task = _base(start, replace(task, experiments=experiments))
@@ -417,7 +417,7 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
         result = judge.conclude()
         return replace(result, remarks=(*result.remarks, *following.notes))
     steps = _steps(base, task)
-    fewer, more = without_stuck_readings(experiments, steps[-1].fit)
+    fewer, more = without_stuck_readings(steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
         stuck += more
         steps, task = _searched(start, replace(task, experiments=fewer))

@@ -243,7 +243,7 @@ def fitted(
         replace(begin, model=model), [*of.fit.unknowns.names, *component.fitted],
         others=of.experiments, sigma=of.fit.sigma, evaluations=_EVALUATIONS, tolerance=1e-4,
     )  # fmt: skip
-    result = hypothesis((*of.causes, component), fit, of.experiments)
+    result = hypothesis((*of.causes, component), fit)
     return None if result is None else Formula(result, component, tuple(terms))
 
 
@@ -301,7 +301,7 @@ def _chosen(now: Formula, place: Place, price: float) -> list[list[_Choice]]:
     steep = [(t, h / place.sizes[t.over]) for t in ratios for h in _STEEP]
     trials = [*dict.fromkeys([*((t, 0.0) for t in library), *steep, *known])]
     effects = [place.component(f"trial{k}", [t], [h]) for k, (t, h) in enumerate(trials)]
-    columns = tangents(fit, now.hypothesis.experiments, effects)
+    columns = tangents(fit, effects)
     at = [k for k, e in enumerate(effects) if e.name in columns]
     sizes = np.array([effects[k].parameters[0].typical(fit.model.values) for k in at])
     colour = now.hypothesis.colour
@@ -356,17 +356,12 @@ _POWERS = 5
 
 
 def model_of(
-    base: Model,
-    fit: Fit,
-    effects: Sequence[Attached],
-    experiments: Sequence[Experiment],
-    *,
-    interrupted: bool = False,
+    base: Model, fit: Fit, effects: Sequence[Attached], *, interrupted: bool = False
 ) -> Model:
     """Return the model of a fit, open at the ports of its effects alone, with how sure it is."""
     model = extended(base, effects)
     values = {n: v for n, v in fit.model.values.items() if n in model.values}
-    sure, inputs = determinacy(fit), [e.record for e in experiments]
+    sure, inputs = determinacy(fit), [e.record for e in fit.experiments]
     return with_origin(
         model.with_values(values), inputs, sure.names, sure.intervals, force_scale="given",
         interrupted=interrupted,
@@ -427,7 +422,7 @@ def formula_of(
         with suppress(PsaError):
             fit = fit_longer_parts(result.hypothesis.fit, whole)
             if follows(fit):
-                model = model_of(base, fit, [*effects, Attached(result.component, port)], whole)
+                model = model_of(base, fit, [*effects, Attached(result.component, port)])
     equation = result.equation(port.balance, model.values)
     parameters = estimates(result.component, model)
     return replace(function, model=model, equation=equation, parameters=parameters)
@@ -438,11 +433,11 @@ def _added(
     scale: Scale,
 ) -> FreeFunction:  # fmt: skip
     """Return a fitted function, and what it adds, with the variable that it follows most."""
-    h, port, experiments = result.hypothesis, place.port, of.experiments
+    h, port = result.hypothesis, place.port
     s = h.fit.model.structure
     term = result.component.equations(Symbols(s.symbols)).add[port.balance]
     variables = [s.symbols[place.symbols[n]] for n in place.names]
-    *rows, added = _along(h.fit, experiments, [*variables, term])
+    *rows, added = _along(h.fit, [*variables, term])
     values = dict(zip(place.names, rows, strict=True))
 
     def scatter(name: str) -> float:
@@ -465,20 +460,18 @@ def _added(
         variable_unit=place.units[name],
         along=values[name],
         added=added,
-        model=model_of(base, h.fit, [*effects, Attached(result.component, port)], experiments),
+        model=model_of(base, h.fit, [*effects, Attached(result.component, port)]),
         fitted=result,
     )
 
 
-def _along(
-    fit: Fit, experiments: Sequence[Experiment], expressions: Sequence[Expression]
-) -> FloatArray:
+def _along(fit: Fit, expressions: Sequence[Expression]) -> FloatArray:
     """Return expressions in a model's symbols along all records (expressions, n)."""
     model, theta, result = fit.model, fit.placed(), []
     s, p = model.structure, model.parameter_vector()
     sums = ca.vertcat(*(s.symbols[n] for n in s.sums)), ca.vertcat(*s.sums.values())
     f = ca.Function("along", s.arguments, [ca.substitute(ca.vertcat(*expressions), *sums)])
-    for r, e in enumerate(experiments):
+    for r, e in enumerate(fit.experiments):
         x = states_of(model, e, fit.unknowns.start(theta, r), fit.way.step_rtol)
         time, u = e.record.time - e.record.time[0], record_inputs(model, e.record, e.record.n)
         result.append(np.array(f.map(len(x))(time, x.T, u.T, np.tile(p[:, None], len(x)))))
@@ -496,7 +489,7 @@ def _decrease(view: View, component: Component) -> float:
     model = fit.model.with_effect(component)
     moved = {p.name: p.typical(fit.model.values) for p in component.parameters}
     starts = tuple(fit.starts())
-    columns, _ = changes(fit, view.of.experiments, model, moved, starts, 0.0)
+    columns, _ = changes(fit, model, moved, starts, 0.0)
     basis = screening.independent(screening.whitened_jacobian(fit, colour))
     free = screening.independent(screening.without(colour.whiten_all(columns), basis))
     residual = screening.without(screening.whitened_residuals(fit, colour), basis)

@@ -442,7 +442,6 @@ class Excess:
 
 def held_out_excess(
     fit: Fit,
-    experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     colour: OwnColour,
     noise: Sequence[NoiseFloor],
@@ -458,8 +457,8 @@ def held_out_excess(
     make an error there too, so that only a clear excess counts. One below the detection limit of a
     stack does not.
     """
-    fitted = [not e.held_out_whole for e in experiments]
-    parts = held_out_residuals(experiments, predicted)
+    fitted = [not e.held_out_whole for e in fit.experiments]
+    parts = held_out_residuals(fit.experiments, predicted)
     beyond = [
         rms(part) / floor.level
         for part, floor, mine in zip(parts, noise, fitted, strict=True)
@@ -470,7 +469,7 @@ def held_out_excess(
     if worst > max(limits.unseen_ratio_of_records, excess.factor):
         excess = Excess(worst, limits.unseen_alarm)
     size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / excess.factor**2))
-    return excess if size > detection_limit_of(fit, experiments, limits) else Excess()
+    return excess if size > detection_limit_of(fit, limits) else Excess()
 
 
 def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:

@@ -473,7 +473,7 @@ class ModelJudge(Judge):
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
         effects = [self.table[s.cause.name] for s in self.kept]
-        return model_of(self.base, self.final.fit, effects, self.experiments)
+        return model_of(self.base, self.final.fit, effects)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions added to a hypothesis; none with causes that leave no structure."""
@@ -517,7 +517,7 @@ class ModelJudge(Judge):
         return None
 
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
-        return noise_told(step.fit, step.screening.colour, self.experiments)
+        return noise_told(step.fit, step.screening.colour)
 
     @cached_property
     def extended(self) -> tuple[FloatArray, ...]:
@@ -525,7 +525,7 @@ class ModelJudge(Judge):
         return tuple(self.final.fit.outputs())
 
     def _changes(self, effects: Sequence[Component]) -> tuple[Size, ...]:
-        return changes(effects, self.final.fit, self.experiments, self.extended)
+        return changes(effects, self.final.fit, self.extended)
 
     def family(self, effect: Component) -> tuple[str, str]:
         """Return the port and the kind of an effect."""

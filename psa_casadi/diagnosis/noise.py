@@ -287,11 +287,11 @@ def detection_limit(
     return float(np.sqrt(rounding**2 + error**2 + (limits.form_of_range * size) ** 2))
 
 
-def detection_limit_of(fit: Fit, experiments: Sequence[Experiment], limits: Thresholds) -> float:
+def detection_limit_of(fit: Fit, limits: Thresholds) -> float:
     """Return the rms [m] below which the residuals of a fit are uninformative of a stack."""
     error = max((s.errors[0] for s in fit.simulated if s.errors), default=0.0)
-    counts = [int(e.used.sum()) for e in experiments]
-    pairs = zip(experiments, fit.record_residuals, strict=True)
+    counts = [part.size for part in fit.record_residuals]
+    pairs = zip(fit.experiments, fit.record_residuals, strict=True)
     squares = [detection_limit(e.record, error, part, limits) ** 2 for e, part in pairs]
     return float(np.sqrt(np.average(squares, weights=counts)))
 
@@ -357,16 +357,14 @@ _FAR = 6.0
 _RARE = 0.2
 
 
-def without_stuck_readings(
-    experiments: Sequence[Experiment], fit: Fit
-) -> tuple[tuple[Experiment, ...], int]:
-    """Return the experiments without repeated readings far from a fit, and how many these are.
+def without_stuck_readings(fit: Fit) -> tuple[tuple[Experiment, ...], int]:
+    """Return a fit's experiments without repeated readings far from it, and how many these are.
 
     Noise repeats a reading by chance here and there; where that is also far from the model, which
     the record alone cannot separate from a stack that is late, the sensor was stuck.
     """
     kept, count = [], 0
-    for e, predicted in zip(experiments, fit.predicted(), strict=True):
+    for e, predicted in zip(fit.experiments, fit.predicted(), strict=True):
         y = measured(e.record)
         residual = np.abs(y - predicted)
         again = np.r_[False, np.diff(y) == 0.0]

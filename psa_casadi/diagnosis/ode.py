@@ -111,9 +111,8 @@ def diagnose_ode(
     ):
         if base.interrupted:
             raise KeyboardInterrupt
-        runs = base.experiments
-        table = _table(base, runs, effects, leave_out, of_zeros)
-        way = _Way(base, runs, choices, table, made, known_hold, progress, watch, [base])
+        table = _table(base, effects, leave_out, of_zeros)
+        way = _Way(base, choices, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
         if _settled(judge):
@@ -162,14 +161,13 @@ def _given(
 
 @dataclass(frozen=True)
 class _Way:
-    """A search from one fit, of whole records or of their parts (`runs`), with `notes`.
+    """A search from one fit, of whole records or of their parts, with `notes`.
 
     `made` returns the whole records; `hold_known` states whether a user has declared what inputs do
     between samples. `so_far` gets every fit that is better than those before it.
     """
 
     base: Fit
-    runs: tuple[Experiment, ...]
     notes: tuple[Note, ...]
     table: Mapping[str, Attached]
     made: Made
@@ -199,7 +197,7 @@ class _Way:
         except KeyboardInterrupt:
             best = self.so_far[-1]
             attached = [self.table[c.name] for c in best.model.effects]
-            model = model_of(self.base.model, best, attached, self.runs, interrupted=True)
+            model = model_of(self.base.model, best, attached, interrupted=True)
             raise DiagnosisInterrupted(model) from None
 
     def _judged(
@@ -207,14 +205,14 @@ class _Way:
     ) -> tuple[ModelJudge, tuple[Note, ...], SearchState]:
         task_of, notes = partial(self._task, names), tuple[Note, ...]()
         if before is None:
-            searched, notes = _search(self.base, self.runs, task_of, hold_known=self.hold_known)
+            searched, notes = _search(self.base, task_of, hold_known=self.hold_known)
         else:
             searched = best_first(before.base, task_of(before.task.experiments), before)
             searched.task.keep(searched.answer.fit)
         known = searched
         hold = known.task.experiments[0].record.hold
         whole = read_like(self.made(None), hold, self.notes)
-        if len(self.runs) > len(whole):
+        if len(self.base.experiments) > len(whole):
             known = _of_whole(known, task_of(whole)) or known
         fit_rivals(known)
         self.progress("judging")
@@ -257,25 +255,25 @@ _Tasks = Callable[[tuple[Experiment, ...]], Task]
 
 
 def _search(
-    base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks, *, hold_known: bool
+    base: Fit, task_of: _Tasks, *, hold_known: bool
 ) -> tuple[SearchState, tuple[Note, ...]]:
     """Search from a base fit, and again where the records' noise differs by what it finds.
 
     And with held inputs, if that is likelier and what they do between samples is not known
     (`hold_known`).
     """
-    known = _once(base, experiments, task_of)
+    known = _once(base, task_of)
     noise = with_noise(known.answer.fit)
-    if unlike(noise, experiments):
+    if unlike(noise, base.experiments):
         known.task.progress("searching again, noise by record")
-        known = _once(reweighted(base, noise), noise, task_of)
+        known = _once(reweighted(base, noise), task_of)
     other = None if hold_known else _held_instead(known, base, task_of)
     return (known, ()) if other is None else other
 
 
-def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> SearchState:
+def _once(base: Fit, task_of: _Tasks) -> SearchState:
     ports = {*ports_of(base.model), *parameter_ports(base.model)}
-    task = task_of(experiments)
+    task = task_of(base.experiments)
     known = best_first(replace(base, model=with_ports(base.model, ports)), task)
     task.keep(known.answer.fit)
     return known
@@ -297,7 +295,7 @@ def _held_instead(
         return None
     others = held_as(runs, hold)
     try:
-        result = _once(refitted(base, others), others, task_of)
+        result = _once(refitted(base, others), task_of)
     except PsaError:
         return None
     nats, more = likelier(result.answer.fit, best.fit), len(result.answer.causes) - len(best.causes)
@@ -327,7 +325,7 @@ def _of_whole(known: SearchState, task: Task) -> SearchState | None:
         for h in (h for h in known.hypotheses.values() if h.causes and h.final):
             with suppress(PsaError):
                 fit = top if h is best else fit_longer_parts(h.fit, task.experiments)
-                result.note(hypothesis(h.causes, fit, task.experiments, final=True))
+                result.note(hypothesis(h.causes, fit, final=True))
         result.conclude()
     except PsaError:
         return None
@@ -336,13 +334,12 @@ def _of_whole(known: SearchState, task: Task) -> SearchState | None:
 
 def _table(
     base: Fit,
-    runs: Sequence[Experiment],
     effects: Sequence[Component],
     leave_out: Sequence[str],
     known: Sequence[str],
 ) -> dict[str, Attached]:
     """Return the effects to search at a model's ports, by name, without those that are `known`."""
-    sizes = sizes_of(base.model, runs, base.starts())
+    sizes = sizes_of(base.model, base.experiments, base.starts())
     every = [*effects_of(base.model, sizes), *(of_ones_own(base.model, c) for c in effects)]
     names = [e.name for e in every]
     for name in leave_out:

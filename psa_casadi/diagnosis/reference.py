@@ -91,7 +91,11 @@ class Healthy:
     """What is known of a device from its healthy records: the base `fit` of all their samples."""
 
     fit: Fit
-    experiments: tuple[Experiment, ...]
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The healthy records."""
+        return self.fit.experiments
 
     @cached_property
     def residuals(self) -> list[FloatArray]:
@@ -186,7 +190,7 @@ class Healthy:
             self.fit.model, others, self.fit.unknowns.names,
             sigma=noise_levels(others), evaluations=_EVALUATIONS,
         )  # fmt: skip
-        (rest,), _ = Healthy(other, others).since([part]).taken_off(1)
+        (rest,), _ = Healthy(other).since([part]).taken_off(1)
         new = [whole(rest)]
         left = fit(other.model, new, (), sigma=noise_levels(new)).residuals
         (floor,) = noise_floor([rest], [left])

@@ -37,7 +37,6 @@ from psa_casadi.model.component import SPECTRAL_PEAKS, Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import (
     accurate,
     input_samples,
@@ -501,7 +500,6 @@ def sizes(
 def changes(
     effects: Sequence[Component],
     fit: Fit,
-    experiments: Sequence[Experiment],
     arrays: Sequence[FloatArray],
 ) -> tuple[Size, ...]:
     """Return by how much effects of any model change each measured output within a record.
@@ -516,7 +514,7 @@ def changes(
         most = np.max([np.ptp(a - b, axis=0)[columns] for a, b in pairs], axis=0)
     except PsaError:
         return ()
-    longest = max(e.record.duration for e in experiments)
+    longest = max(e.record.duration for e in fit.experiments)
     return tuple(
         Size("record", float(size), o.channel.unit, None, longest, "s", None, output=o.column)
         for size, o in zip(most, fit.channels, strict=True)

@@ -95,19 +95,19 @@ class Screening:
 def screen(
     fit: Fit,
     trials: Sequence[Direction],
-    lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
     *,
     colour: Colour | None = None,
     limits: Thresholds = LIMITS,
 ) -> Screening:
-    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
+    """Score the directions on a fit's residuals.
 
     `known` is the colour of the records' noise where it is known without a model; `colour` replaces
     the whole estimate.
     """
     columns = channel_columns(fit, trials)
     if colour is None:
+        lengths = [part.size for part in fit.record_residuals]
         colour = _unexplained(fit.channels[0], columns[0], lengths, known)
     if not colour.further:
         rows = zip(fit.further, columns[1:], strict=True)

@@ -108,13 +108,13 @@ def _fitted(step: Step, name: str) -> Hypothesis | None:
     return known if known is None or known.final else to_end(known)
 
 
-def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
+def _difference(one: Fit, other: Fit) -> tuple[float, float]:
     """Return by how much the plants of two fits differ on the records: most [m], and % of range.
 
     About the mean difference of each record, as the sensor's zero is free.
     """
     most = span = 0.0
-    for k, e in enumerate(experiments):
+    for k, e in enumerate(one.experiments):
         moved = []
         for fit in (one, other):
             plant = fit.model.plant()
@@ -129,7 +129,6 @@ def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tupl
 
 def diagnosed_model(
     fit: Fit,
-    experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     stiffness_given: bool,
     spent: held_out.StackBudget | None = None,
@@ -138,7 +137,7 @@ def diagnosed_model(
     result = determinacy(fit)
     evidence = replace(
         evidence_of(fit, result, predicted, by="psa diagnose"),
-        held_out=_held_out(experiments, predicted),
+        held_out=_held_out(fit.experiments, predicted),
         budget=None
         if spent is None
         else ErrorBudget(
@@ -150,7 +149,7 @@ def diagnosed_model(
             unnamed=None if spent.unnamed is None else _share(spent.unnamed),
         ),
     )
-    records = [e.record for e in experiments]
+    records = [e.record for e in fit.experiments]
     return with_provenance(fit.model, result, records, stiffness_given, evidence=evidence)
 
 
@@ -220,7 +219,7 @@ class StackJudge(Judge):
         return self._model_of(self.final.view.of, self.spent)
 
     def _model_of(self, of: Hypothesis, spent: held_out.StackBudget | None = None) -> Model:
-        return diagnosed_model(of.fit, self.experiments, of.predicted, self.scale_given, spent)
+        return diagnosed_model(of.fit, of.predicted, self.scale_given, spent)
 
     @cached_property
     def spent(self) -> held_out.StackBudget:
@@ -234,13 +233,12 @@ class StackJudge(Judge):
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Return the corrections of a hypothesis, by columns at the stack's ports."""
-        return corrections(of.fit, self.experiments, self.last.screening.colour)
+        return corrections(of.fit, self.last.screening.colour)
 
     def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
         excess = held_out_excess(
-            step.fit, self.experiments, step.predicted, step.view.of.colours[0], self.floors,
-            self.limits,
+            step.fit, step.predicted, step.view.of.colours[0], self.floors, self.limits
         )  # fmt: skip
         return (note("held_out_error", factor=excess.factor), excess.p_value) if excess else None
 
@@ -297,7 +295,7 @@ class StackJudge(Judge):
                 if other is None:
                     continue
                 try:
-                    differs = _difference(final, other.fit, self.experiments)
+                    differs = _difference(final, other.fit)
                 except PsaError:
                     continue
                 model = self._model_of(other)
@@ -313,7 +311,7 @@ class StackJudge(Judge):
         both = self.first.predicted, final.predicted
         misfits = self.misfits(self.missed_errors)
         records = [e.record for e in experiments]
-        groups = same_curves(experiments, self.task.table, self.first.fit)
+        groups = same_curves(self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
         base, extended = (held_out.errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
@@ -357,6 +355,6 @@ def patched_model(d: Diagnosis) -> Model:
         return d.correction.model
     if not isinstance(d, StackDiagnosis) or d.patch is None:
         raise InputError("No unnamed correction removes more than the extended model does.")
-    fit = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
+    fit = with_patch(d.extended_fit, d.patch, d.extended)
     inputs = d.model.provenance.force_scale == "given"
-    return diagnosed_model(fit, d.experiments, fit.predicted(), inputs)
+    return diagnosed_model(fit, fit.predicted(), inputs)

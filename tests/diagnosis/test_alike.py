@@ -56,7 +56,7 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     assert cause.confidence == pytest.approx(one, rel=1e-3)
     assert one == pytest.approx(other, rel=1e-3)
     assert "no voltage below the resonances separates" in result.next_experiment.why
-    output, _ = one_of_each(result.contenders, result.experiments)
+    output, _ = one_of_each(result.contenders)
     assert len(output) == 1
     with pytest.raises(InputError, match="bend the same curve"):
         resolving_experiment(result)

@@ -78,7 +78,7 @@ HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
 def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> None:
     y = _measured(clean, HIDDEN[hidden](clean))
     result, experiments, colour = _fitted(y)
-    observed = corrections(result, experiments, colour)
+    observed = corrections(result, colour)
     base = (np.asarray(result.predicted()[0]),)
     patch = best_of(observed, experiments, [_held(result, experiments)], colour)
     assert patch is not None
@@ -97,11 +97,11 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
     predicted = result.predicted()
     held = held_out_rms(experiments, predicted)
     kind, port = hidden.split(" at the ")
-    items = [c for c in corrections(result, experiments, colour) if c.kind == kind]
+    items = [c for c in corrections(result, colour) if c.kind == kind]
     items = [c for c in items if c.port == port]
     patch = best_of(items, experiments, [held], colour)
     assert isinstance(patch, Patch)
-    again = with_patch(result, patch, experiments, predicted)
+    again = with_patch(result, patch, predicted)
     after = held_out_rms(experiments, again.predicted())
     assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
     model = loads(dumps(again.model))
@@ -112,17 +112,17 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
 
 def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
     result, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
-    modes = [c for c in corrections(result, experiments, colour) if c.kind == "modes"]
+    modes = [c for c in corrections(result, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
     with pytest.raises(InputError, match="no form that a model could hold"):
-        with_patch(result, patch, experiments, result.predicted())
+        with_patch(result, patch, result.predicted())
 
 
 def test_noise_gets_no_correction(clean: FloatArray) -> None:
     noise = NOISE * np.random.default_rng(3).standard_normal(TIME.size)
     result, experiments, colour = _fitted(clean + noise)
-    observed = corrections(result, experiments, colour)
+    observed = corrections(result, colour)
     assert max(c.evidence for c in observed) < 3.0
     assert best_of(observed, experiments, [_held(result, experiments)], colour) is None
 

@@ -53,7 +53,7 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     observed = replace(result, residuals=used)
     colour = _own(experiments, [error])
     noise = noise_floor([experiments[0].record], [error])
-    return held_out_excess(observed, experiments, (clean,), colour, noise, LIMITS).factor
+    return held_out_excess(observed, (clean,), colour, noise, LIMITS).factor
 
 
 @slow
@@ -105,9 +105,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
         colour = _own(experiments, left)
-        items.append(
-            held_out_excess(observed, experiments, predicted, colour, noise, LIMITS).factor
-        )
+        items.append(held_out_excess(observed, predicted, colour, noise, LIMITS).factor)
     assert items == [1.0] * 25
 
 

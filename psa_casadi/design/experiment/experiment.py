@@ -409,7 +409,7 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    contenders, _ = one_of_each(d.contenders, d.experiments)
+    contenders, _ = one_of_each(d.contenders)
     if len(contenders) < 2 or (limits is not None and not _slow(limits)):
         contenders = d.contenders  # a new record that shows resonances may separate them
     contenders = tuple(sorted(contenders, key=lambda c: -c.evidence)[:_RIVALS])

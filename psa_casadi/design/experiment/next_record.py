@@ -234,7 +234,7 @@ def _of_a_stack(
         return [rival_of_model(model.name, model, names)], None, None
     effects = [EFFECTS[e] if isinstance(e, str) else e for e in separate]
     if records is not None:
-        base, contenders, _ = fit_contenders(records, effects, model=model, progress=progress)
+        base, contenders = fit_contenders(records, effects, model=model, progress=progress)
         return _fitted(base, contenders, {})
     plain = model.without(e.name for e in effects)
     free = [n for n in free if n in plain.parameter_names]

@@ -38,7 +38,7 @@ from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.split import whole
 from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Share of the best one's evidence from which neighbours are nearly as likely, and distance from it
@@ -231,7 +231,7 @@ class SearchState:
         levelled = relevelled(ended.fit, every=True)
         if levelled is ended.fit:
             return ended
-        return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
+        return hypothesis(ended.causes, levelled, final=True) or ended
 
     def is_admissible(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
@@ -244,7 +244,7 @@ class SearchState:
 
     def _may_hold(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
         out, pack = self.task.method.without, self.task.pack
-        if not pack.is_admissible(h.fit, cause, h.experiments):
+        if not pack.is_admissible(h.fit, cause):
             return False
         before = self.hypotheses.get(h.names - {cause.name})
         least = self.views[NONE].test.detection_limit
@@ -308,7 +308,7 @@ class SearchState:
             return True
         if (h, before) not in self.memories:
             added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
-            dynamic = is_dynamic(added, before.fit, h.experiments, self.task.limits)
+            dynamic = is_dynamic(added, before.fit, self.task.limits)
             self.memories[h, before] = dynamic
         return self.memories[h, before]
 
@@ -457,7 +457,7 @@ def _judged(
     for group in similar:
         if good & set(group):
             every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
-            like = {n for n, h, c in every if pack.is_admissible(h.fit, c, task.experiments)}
+            like = {n for n, h, c in every if pack.is_admissible(h.fit, c)}
             refused = refused - (set(group) & like)
         elif refused & set(group):
             refused = refused | set(group)
@@ -487,16 +487,14 @@ def contenders(step: Step, limits: Thresholds, names: Sequence[str] = ()) -> tup
     return tuple(Contender(n, result[n].fit, known[n]) for n in names if n in result)
 
 
-def one_of_each(
-    result: Sequence[Contender], experiments: Sequence[Experiment]
-) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
+def one_of_each(result: Sequence[Contender]) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
     """Return the contenders that a voltage may separate, and notes on those that none separates.
 
     Of effects that bend the same curve the best fit represents all.
     """
     best = sorted(result, key=lambda c: c.fit.cost)
     effects = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
-    groups = same_curves(experiments, effects, best[0].fit) if best else ()
+    groups = same_curves(effects, best[0].fit) if best else ()
     rest = {name for group in groups for name in group[1:]}
     same = tuple(note("same_curve", effects=group) for group in groups)
     return tuple(c for c in result if c.effect not in rest), same
@@ -508,7 +506,7 @@ def fit_contenders(
     *,
     model: Model | None = None,
     progress: Progress = silent,
-) -> tuple[Fit, tuple[Contender, ...], tuple[Experiment, ...]]:
+) -> tuple[Fit, tuple[Contender, ...]]:
     """Fit the base and each of the named effects to records in full, without a verdict.
 
     Raises InputError where an effect cannot be fitted to them.
@@ -517,7 +515,7 @@ def fit_contenders(
     start = chosen_start(records, model, None)[0].without(e.name for e in effects)
     base = fit_base(start, experiments, progress=progress)
     task = Task(experiments, tuple(effects), STACK, progress=progress)
-    return base, fitted_rivals(base, task), experiments
+    return base, fitted_rivals(base, task)
 
 
 def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
@@ -525,7 +523,7 @@ def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
 
     Raises InputError where an effect cannot be fitted.
     """
-    plain = hypothesis((), base, task.experiments, final=True)
+    plain = hypothesis((), base, final=True)
     if plain is None:
         raise InputError(["The fitted base cannot be simulated over the whole of these records."])
     view = examine(plain, task)
