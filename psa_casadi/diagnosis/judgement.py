@@ -90,7 +90,7 @@ class Judge:
     def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
         self.steps, self.task, self.driven = tuple(steps), task, driven
         self.first, self.last, self.searched = self.steps[0], self.steps[-1], self.steps[:-1]
-        self.experiments, self.limits = task.experiments, task.limits
+        self.experiments, self.limits = self.first.fit.experiments, task.limits
         self._left: dict[Step, Remaining] = {}
 
     # What depends on the kind of device

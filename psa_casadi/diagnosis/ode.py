@@ -4,7 +4,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -203,27 +202,25 @@ class _Way:
     def _judged(
         self, names: Collection[str], before: SearchState | None = None
     ) -> tuple[ModelJudge, tuple[Note, ...], SearchState]:
-        task_of, notes = partial(self._task, names), tuple[Note, ...]()
+        task, notes = self._task(names), tuple[Note, ...]()
         if before is None:
-            searched, notes = _search(self.base, task_of, hold_known=self.hold_known)
+            searched, notes = _search(self.base, task, hold_known=self.hold_known)
         else:
-            searched = best_first(before.base, task_of(before.task.experiments), before)
-            searched.task.keep(searched.answer.fit)
+            searched = best_first(before.base, task, before)
+            task.keep(searched.answer.fit)
         known = searched
-        hold = known.task.experiments[0].record.hold
+        hold = known.base.experiments[0].record.hold
         whole = read_like(self.made(None), hold, self.notes)
         if len(self.base.experiments) > len(whole):
-            known = _of_whole(known, task_of(whole)) or known
+            known = _of_whole(known, whole) or known
         fit_rivals(known)
         self.progress("judging")
         return ModelJudge(known, self.base.model, self.table, whole), notes, searched
 
-    def _task(self, names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
+    def _task(self, names: Collection[str]) -> Task:
         chosen = tuple(self.table[n].component for n in names)
         method = Method(without=_OF_STACKS)
-        return Task(
-            experiments, chosen, Pack(), method, self.progress, self.so_far.append, self.watch
-        )
+        return Task(chosen, Pack(), method, self.progress, self.so_far.append, self.watch)
 
 
 def _better(new: ModelJudge, old: ModelJudge) -> bool:
@@ -251,43 +248,35 @@ def _coloured(judge: ModelJudge) -> bool:
     return judge.verdict == "adequate" and any(c.autoregression.size for c in colours)
 
 
-_Tasks = Callable[[tuple[Experiment, ...]], Task]
-
-
-def _search(
-    base: Fit, task_of: _Tasks, *, hold_known: bool
-) -> tuple[SearchState, tuple[Note, ...]]:
+def _search(base: Fit, task: Task, *, hold_known: bool) -> tuple[SearchState, tuple[Note, ...]]:
     """Search from a base fit, and again where the records' noise differs by what it finds.
 
     And with held inputs, if that is likelier and what they do between samples is not known
     (`hold_known`).
     """
-    known = _once(base, task_of)
+    known = _once(base, task)
     noise = with_noise(known.answer.fit)
     if unlike(noise, base.experiments):
-        known.task.progress("searching again, noise by record")
-        known = _once(reweighted(base, noise), task_of)
-    other = None if hold_known else _held_instead(known, base, task_of)
+        task.progress("searching again, noise by record")
+        known = _once(reweighted(base, noise), task)
+    other = None if hold_known else _held_instead(known, base)
     return (known, ()) if other is None else other
 
 
-def _once(base: Fit, task_of: _Tasks) -> SearchState:
+def _once(base: Fit, task: Task) -> SearchState:
     ports = {*ports_of(base.model), *parameter_ports(base.model)}
-    task = task_of(base.experiments)
     known = best_first(replace(base, model=with_ports(base.model, ports)), task)
     task.keep(known.answer.fit)
     return known
 
 
-def _held_instead(
-    known: SearchState, base: Fit, task_of: _Tasks
-) -> tuple[SearchState, tuple[Note, ...]] | None:
+def _held_instead(known: SearchState, base: Fit) -> tuple[SearchState, tuple[Note, ...]] | None:
     """Return the result with inputs the other way between samples, if that is likelier.
 
     Looked for where the answer is likelier so, or has straight lines that are late by half a
     sampling interval. A cause counts as much as for the choice itself.
     """
-    best, runs, hold = known.answer, known.task.experiments, other_hold(known.task.experiments)
+    best, runs, hold = known.answer, known.base.experiments, other_hold(known.base.experiments)
     step = float(np.median([e.record.sample_time for e in runs]))
     times = [best.fit.model.values[f"{c.name}_time"] for c in best.causes if c.name in _late(base)]
     late = hold == "zero" and any(_HALF[0] < t / step < _HALF[1] for t in times)
@@ -295,7 +284,7 @@ def _held_instead(
         return None
     others = held_as(runs, hold)
     try:
-        result = _once(refitted(base, others), task_of)
+        result = _once(refitted(base, others), known.task)
     except PsaError:
         return None
     nats, more = likelier(result.answer.fit, best.fit), len(result.answer.causes) - len(best.causes)
@@ -309,22 +298,22 @@ def _late(base: Fit) -> set[str]:
     return {f"{kind}_of_{n}" for kind in ("delay", "lag") for n in base.model.input_names}
 
 
-def _of_whole(known: SearchState, task: Task) -> SearchState | None:
-    """Return the results of parts of records as hypotheses of whole ones.
+def _of_whole(known: SearchState, whole: Sequence[Experiment]) -> SearchState | None:
+    """Return the results of parts of records as hypotheses of the `whole` ones.
 
     None where the result does not follow these.
     """
     best = known.answer
-    task.progress("fitting the whole records")
+    known.task.progress("fitting the whole records")
     try:
-        top = fit_longer_parts(best.fit, task.experiments)
+        top = fit_longer_parts(best.fit, whole)
         if not best.causes or not follows(top):
             return None
-        base = fit_longer_parts(known.root.fit, task.experiments)
-        result = SearchState(levelled(base), task)
+        base = fit_longer_parts(known.root.fit, whole)
+        result = SearchState(levelled(base), known.task)
         for h in (h for h in known.hypotheses.values() if h.causes and h.final):
             with suppress(PsaError):
-                fit = top if h is best else fit_longer_parts(h.fit, task.experiments)
+                fit = top if h is best else fit_longer_parts(h.fit, whole)
                 result.note(hypothesis(h.causes, fit, final=True))
         result.conclude()
     except PsaError:

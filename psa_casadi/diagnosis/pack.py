@@ -142,14 +142,13 @@ STACK = StackPack()
 
 @dataclass(frozen=True)
 class Task:
-    """The records, the effects to search, what knows the device, the method, and the observers.
+    """The effects to search, what knows the device, the method, and the observers.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
     interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made. Of a
     base that is known but for its parameters `free` only these are fitted.
     """
 
-    experiments: tuple[Experiment, ...]
     table: tuple[Component, ...]
     pack: Pack
     method: Method = field(default_factory=Method)
@@ -164,10 +163,9 @@ class Task:
         """The constants that decide."""
         return self.method.thresholds
 
-    @property
-    def fast(self) -> bool:
-        """Whether the device may ring within a record's band."""
-        return self.pack.is_stack and shows_ringing(self.experiments)
+    def is_fast(self, fit: Fit) -> bool:
+        """Whether the device may ring within the band of a record of a fit."""
+        return self.pack.is_stack and shows_ringing(fit.experiments)
 
     def indistinguishable(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot separate but by forms nobody knows."""

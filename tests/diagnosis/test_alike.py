@@ -38,7 +38,7 @@ def test_bends_are_alike_where_no_resonance_shows(
     displayed = simulate(model, time, voltage).displacement
     experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
     result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
-    groups = Task(experiments, TABLE, STACK).indistinguishable(result)
+    groups = Task(TABLE, STACK).indistinguishable(result)
     assert tuple(tuple(sorted(group)) for group in groups) == alike
 
 

@@ -215,7 +215,7 @@ def rivals_of(
         ], None, None  # fmt: skip
     opened = replace(base, model=with_ports(base.model))
     components = tuple(e.component for e in effects)
-    task = Task(runs, components, Pack(), progress=progress)
+    task = Task(components, Pack(), progress=progress)
     return _fitted(base, fitted_rivals(opened, task), words)
 
 

@@ -251,7 +251,7 @@ class _Search:
         if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
             return False
         less = self.known.hypotheses.get(h.names - {name})
-        if less is None or not (name in h.names or (self.task.fast and not h.causes)):
+        if less is None or not (name in h.names or (self.task.is_fast(h.fit) and not h.causes)):
             return False
         if self.shaken.get(less.names) is less.fit or not self.does("several modes"):
             return False
@@ -330,7 +330,7 @@ class _Search:
         task = self.task
         if not view.test.alarm or not self.does("resonances"):
             return False
-        if task.fast and not h.causes and self.seen_in_records():
+        if task.is_fast(h.fit) and not h.causes and self.seen_in_records():
             return True
         if not self.once("ringing", h.names):
             return False

@@ -514,7 +514,7 @@ def fit_contenders(
     experiments = tuple(whole(as_read(r)) for r in records)
     start = chosen_start(records, model, None)[0].without(e.name for e in effects)
     base = fit_base(start, experiments, progress=progress)
-    task = Task(experiments, tuple(effects), STACK, progress=progress)
+    task = Task(tuple(effects), STACK, progress=progress)
     return base, fitted_rivals(base, task)
 
 
