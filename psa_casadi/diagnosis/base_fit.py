@@ -295,10 +295,7 @@ def _as_good(other: Fit, short: float) -> float:
 
 
 def _with_ringing(
-    fit: Fit,
-    progress: Progress,
-    value: float = 0.0,
-    least: float = np.inf,
+    fit: Fit, progress: Progress, value: float = 0.0, least: float = np.inf
 ) -> Fit | None:
     """Fit with a mass free, from the resonances that the residual's ringing may be of.
 
@@ -329,9 +326,7 @@ def _masses(
 
 
 def _with_masses(
-    before: Fit,
-    starts: Sequence[Mapping[str, float]],
-    least: float = np.inf,
+    before: Fit, starts: Sequence[Mapping[str, float]], least: float = np.inf
 ) -> Fit | None:
     """Fit with one mass free from several starts; None where none explains clearly more.
 

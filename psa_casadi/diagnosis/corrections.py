@@ -265,13 +265,8 @@ class Patch(Correction):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
-        return {
-            "kind": self.kind,
-            "port": self.port,
-            "sentence": self.sentence,
-            "evidence": self.evidence,
-            "open_to": list(self.open_to),
-        }
+        names = ("kind", "port", "sentence", "evidence")
+        return {**{n: getattr(self, n) for n in names}, "open_to": list(self.open_to)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -154,11 +154,7 @@ _RIVAL = 0.01
 
 
 def column_decisions(
-    steps: Sequence[Step],
-    task: Task,
-    table: Sequence[Component],
-    start: Model,
-    verdict: Verdict,
+    steps: Sequence[Step], task: Task, table: Sequence[Component], start: Model, verdict: Verdict
 ) -> tuple[Decision, ...]:
     """Return what every fitted column, and a measured load, decided.
 

@@ -322,10 +322,7 @@ def _of_whole(known: SearchState, whole: Sequence[Experiment]) -> SearchState | 
 
 
 def _table(
-    base: Fit,
-    effects: Sequence[Component],
-    leave_out: Sequence[str],
-    known: Sequence[str],
+    base: Fit, effects: Sequence[Component], leave_out: Sequence[str], known: Sequence[str]
 ) -> dict[str, Attached]:
     """Return the effects to search at a model's ports, by name, without those that are `known`."""
     sizes = sizes_of(base.model, base.experiments, base.starts())

@@ -498,9 +498,7 @@ def sizes(
 
 
 def changes(
-    effects: Sequence[Component],
-    fit: Fit,
-    arrays: Sequence[FloatArray],
+    effects: Sequence[Component], fit: Fit, arrays: Sequence[FloatArray]
 ) -> tuple[Size, ...]:
     """Return by how much effects of any model change each measured output within a record.
 
