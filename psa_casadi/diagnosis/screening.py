@@ -149,9 +149,9 @@ def _unexplained(
 def _unit_vectors(
     left: FloatArray, whole: FloatArray, least: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return columns over their norms, and these; 0 where hardly more is left than rounding.
+    """Return the unit vectors of columns (n, k), and their norms (k,).
 
-    Of what is `left` of the `whole` that is no more than the share `least`.
+    Both are 0 for a column of which no more than the share `least` of the `whole` is `left`.
     """
     norms = np.linalg.norm(left, axis=0)
     usable = norms > least * np.linalg.norm(whole, axis=0)
