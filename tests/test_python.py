@@ -264,11 +264,11 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     ),
     "Identification": (
         lambda: swing()[1],
-        lambda i: [*i.fit.outputs(i.experiments), repr(i), i.to_json(), *driven(i.model)],
+        lambda i: [*i.fit.outputs(), repr(i), i.to_json(), *driven(i.model)],
     ),
     "StackIdentification": (
         identification,
-        lambda i: [*i.fit.predicted(i.experiments), repr(i), i.to_json(), i.determinacy.names],
+        lambda i: [*i.fit.predicted(), repr(i), i.to_json(), i.determinacy.names],
     ),
     "StackDiagnosis": (
         lambda: diagnosis("cause_named"),
@@ -276,7 +276,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     ),
     "Diagnosis": (
         lambda: swing()[2],
-        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs(d.experiments)],
+        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs()],
     ),
     "Comparison": (
         lambda: psa.compare(swing()[1], swing()[2]), lambda c: [repr(c), *map(repr, c.differences)],

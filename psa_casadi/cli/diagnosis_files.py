@@ -13,7 +13,7 @@ from psa_casadi.common.errors import PsaError
 from psa_casadi.common.files import atomic_write
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.records import write_record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
@@ -84,7 +84,7 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    contenders, same = one_of_each(d.contenders, d.experiments)
+    contenders, same = one_of_each(d.contenders)
     if same and len(contenders) < 2:
         return d
     before = d.next_experiment

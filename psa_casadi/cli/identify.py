@@ -137,8 +137,8 @@ def _finish(
     try:
         save()
         names = () if ended else identification.determinacy.names
-        fit, experiments = identification.fit, identification.experiments
-        profiles = [profile(fit, experiments, n, progress=progress) for n in wanted if n in names]
+        fit = identification.fit
+        profiles = [profile(fit, n, progress=progress) for n in wanted if n in names]
         content = partial(identification_file, identification, profiles)
         files.write("--json", lambda path: atomic_write(path, json_text(content())))
         if outputs["--report"] is not None and not ended:

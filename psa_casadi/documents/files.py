@@ -15,8 +15,7 @@ from psa_casadi.common.display import Lined
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import Note
 from psa_casadi.common.strict_json import brief, decode, read_json
-from psa_casadi.diagnosis.corrections import Estimate
-from psa_casadi.diagnosis.families import Family
+from psa_casadi.diagnosis.corrections import Estimate, Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
     ANY_MODEL,

@@ -18,7 +18,6 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import Interval
 from psa_casadi.records.noise import autocovariance, convolved
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
 
 #: A parameter with a standard error above this, in ordinary changes or ln units, is undetermined.
 DETERMINED_WIDTH = 0.5
@@ -47,7 +46,6 @@ class Determinacy:
 
 def determinacy(
     fit: Fit,
-    experiments: Sequence[Experiment],
     *,
     not_unique: Sequence[str] = (),
     assumed: FloatArray | None = None,
@@ -65,7 +63,7 @@ def determinacy(
     unknowns = fit.unknowns
     count = len(unknowns.names)
     slopes = unknowns.slopes(fit.theta)
-    covariance = covariance_of(fit, experiments)
+    covariance = covariance_of(fit)
     if assumed is not None:
         covariance = covariance + np.outer(assumed, assumed)
     of_values = slopes @ covariance[:count, :count] @ slopes.T
@@ -99,21 +97,15 @@ def determinacy(
     )
 
 
-def weighted_rows(
-    fit: Fit, experiments: Sequence[Experiment]
-) -> list[tuple[FloatArray, FloatArray]]:
+def weighted_rows(fit: Fit) -> list[tuple[FloatArray, FloatArray]]:
     """Return Jacobian and residuals over their level, of every record and further column."""
-    parts = [fit.of_record(experiments, r) for r in range(len(fit.sigma))]
-    rows = [
-        (fit.jacobian[p] / s, fit.residuals[p] / s) for p, s in zip(parts, fit.sigma, strict=True)
-    ]
+    parts = zip(fit.parts, fit.sigma, strict=True)
+    rows = [(fit.jacobian[p] / s, fit.residuals[p] / s) for p, s in parts]
     rows += [(f.jacobian / f.level, f.residuals / f.level) for f in fit.further]
     return [row for row in rows if len(row[1])]
 
 
-def covariance_of(
-    fit: Fit, experiments: Sequence[Experiment], *, white: bool = False
-) -> FloatArray:
+def covariance_of(fit: Fit, *, white: bool = False) -> FloatArray:
     """Return the covariance (size, size) of theta, for residuals that may be coloured.
 
     The sandwich H^-1 (sum_r J_r^T C_r J_r / w_r^4 + P) H^-1 with H = sum_r J_r^T J_r / w_r^2 + P:
@@ -125,7 +117,7 @@ def covariance_of(
     """
     precision = np.diag(1.0 / fit.unknowns.prior**2)
     curvature, spread = precision.copy(), precision.copy()
-    for scaled, residuals in weighted_rows(fit, experiments):
+    for scaled, residuals in weighted_rows(fit):
         curvature += scaled.T @ scaled
         if white:
             continue
@@ -148,7 +140,7 @@ def covariance_of(
     return 0.5 * (more + more.T)
 
 
-def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | None:
+def assumed_ratio(fit: Fit) -> FloatArray | None:
     """Return the change of theta (size,) by one standard deviation of the assumed ln(k_P / k_B).
 
     k_P / k_B sets the zero -(k_P + k_B)/(c_P + c_B) and the static gain, eqs. (11), (14). Where
@@ -164,10 +156,10 @@ def assumed_ratio(fit: Fit, experiments: Sequence[Experiment]) -> FloatArray | N
     change = {n: softer * p[n] for n in forces} | {n: p[n] for n in ("k_P", "c_P", "m_P")}
     curvature = np.diag(1.0 / fit.unknowns.prior**2)
     pull = np.zeros(fit.unknowns.size)
-    for r, (level, e) in enumerate(zip(fit.sigma, experiments, strict=True)):
+    for r, (level, e) in enumerate(zip(fit.sigma, fit.experiments, strict=True)):
         if not e.stop:
             continue
-        scaled = fit.jacobian[fit.of_record(experiments, r)] / level
+        scaled = fit.jacobian[fit.parts[r]] / level
         start = fit.start(r)
         _, by_parameter, by_start = predict_record(
             fit.model, e.record, start, list(change), stop=e.stop, rtol=FIT_RTOL

@@ -19,7 +19,6 @@ from psa_casadi.model.evidence import (
 from psa_casadi.model.variables import Interval
 from psa_casadi.records.noise import fast_noise, runs_of
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.simulate import record_inputs
 
 #: The most samples of a reference run, and what straight lines between them may miss the voltage
@@ -34,7 +33,6 @@ _NOISE = 6.0 * np.sqrt(2.0)
 def evidence_of(
     fit: Fit,
     determinacy: Determinacy,
-    experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     *,
     by: str,
@@ -42,13 +40,13 @@ def evidence_of(
 ) -> Evidence:
     """Return the evidence of a fit: ranges of the inputs, covariance, runs to simulate again.
 
-    `predicted` [m] are the records in full, in the order of `experiments`; `sampled` the records
+    `predicted` [m] are the records in full, in the order of the experiments; `sampled` the records
     before block averages, if there are any. Held-out samples have the error of the
     runs; its interval and the budget are the diagnosis's to add.
     """
-    model, records = fit.model, [e.record for e in experiments]
-    runs, used, theta = [], [], fit.placed(experiments)
-    for k, (e, y) in enumerate(zip(experiments, predicted, strict=True)):
+    model, records = fit.model, [e.record for e in fit.experiments]
+    runs, used, theta = [], [], fit.placed()
+    for k, (e, y) in enumerate(zip(fit.experiments, predicted, strict=True)):
         x0 = record_start(model, e.record, fit.unknowns.start(theta, k))
         errors = measured(e.record) - y
         inputs = sampled[k] if sampled else e.record
@@ -66,7 +64,7 @@ def evidence_of(
                 held_out=tuple(runs_of(e.held_out)),
             )
         )
-    chosen = next((k for k, e in enumerate(experiments) if e.held_out_whole), 0)
+    chosen = next((k for k, e in enumerate(fit.experiments) if e.held_out_whole), 0)
     matrix = 0.5 * (determinacy.covariance + determinacy.covariance.T)
     known = np.isfinite(matrix).all()  # without names where it has overflowed
     rows = tuple(tuple(row) for row in matrix.tolist())

@@ -47,7 +47,7 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
+from psa_casadi.records.split import excerpts, whole, without_gaps
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 
 #: Rounds of fitting with every record's residual as its noise level.
@@ -121,13 +121,11 @@ def identify(
     result, preferred = search_forms(
         forms, experiments, linear=linear, thorough=True, progress=progress
     )
-    best, experiments = _on_even_clock(*relevelled(result.best, experiments), notes)
-    best = _with_record_levels(best, experiments, progress)
+    best = _on_even_clock(relevelled(result.best), notes)
+    best = _with_record_levels(best, progress)
     if best.interrupted:
         current_work().wrap_up()
-    determined = determinacy(
-        best, experiments, not_unique=result.not_unique, assumed=assumed_ratio(best, experiments)
-    )
+    determined = determinacy(best, not_unique=result.not_unique, assumed=assumed_ratio(best))
     open_ones = free_combinations(best.model, determined, force_scale_given=inputs)
     advised: tuple[Advice, ...] | None = None
     evidence: Evidence | None = None
@@ -137,14 +135,13 @@ def identify(
             evidence = evidence_of(
                 best,
                 determined,
-                experiments,
-                best.predicted(experiments),
+                best.predicted(),
                 by="psa identify",
                 sampled=[known[r.sha256] for r in fitted],
             )
-            noise = noise_found(best, experiments, parts)
+            noise = noise_found(best, parts)
             progress("what further records would tell")
-            advised = advice(best, experiments, determined, force_scale_given=inputs)
+            advised = advice(best, determined, force_scale_given=inputs)
         except KeyboardInterrupt:
             current_work().wrap_up()
     return StackIdentification(
@@ -158,11 +155,10 @@ def identify(
         ),
         fit=best,
         determinacy=determined,
-        experiments=experiments,
         doubts=(
             *(s for doubt in _DOUBTS if (s := doubt(fitted))),
             *doubts_of(best, determined, result.starts, result.not_unique),
-            *_excess_notes(best, experiments),
+            *_excess_notes(best),
         ),
         starts=result.starts,
         notes=(
@@ -218,41 +214,39 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
     )  # fmt: skip
 
 
-def _on_even_clock(
-    best: Fit, experiments: tuple[Experiment, ...], notes: list[Note | str]
-) -> tuple[Fit, tuple[Experiment, ...]]:
+def _on_even_clock(best: Fit, notes: list[Note | str]) -> Fit:
     """Fit samples at even times where the data say that the stamps jitter."""
-    even = None if best.interrupted else even_clock(best, experiments)
+    even = None if best.interrupted else even_clock(best)
     if even is not None:
-        again = refit(best, even[0])
+        again = refit(best, others=even[0])
         if again.rms < best.rms:
             notes.append(even[1])
-            return again, even[0]
-    return best, experiments
+            return again
+    return best
 
 
-def _with_record_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def _with_record_levels(best: Fit, progress: Progress) -> Fit:
     """Fit again with every record's residual as its noise level: its maximum-likelihood estimate.
 
     One record alone needs no second fit, since a common factor moves nothing but the weak priors.
     """
-    for _ in range(_LEVEL_ROUNDS if len(experiments) > 1 else 0):
-        levels = record_rms(best, experiments)
+    for _ in range(_LEVEL_ROUNDS if len(best.experiments) > 1 else 0):
+        levels = record_rms(best)
         change = np.max(np.abs(np.log(np.array(levels) / np.array(best.sigma))))
         if best.interrupted or change < 0.02:
             break
         progress("base fit with every record's own noise level")
         try:
-            best = refit(best, experiments, sigma=levels)
+            best = refit(best, sigma=levels)
         except KeyboardInterrupt:
             return replace(best, interrupted=True, converged=False)
     return best
 
 
-def _excess_notes(best: Fit, experiments: Sequence[Experiment]) -> list[Note]:
+def _excess_notes(best: Fit) -> list[Note]:
     """Return notes on the records whose residual exceeds their noise."""
     notes = []
-    for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
+    for e, residual in zip(best.experiments, best.record_residuals, strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)

@@ -62,22 +62,21 @@ def identify_ode(
     signals = given_to(model, records, hold)
     shifted = known_zeros(model, zeros)
     progress("fitting from several starts")
-    *_, (best, runs, outcomes, notes) = ways(
+    *_, (best, outcomes, notes) = ways(
         model, signals,
         lambda length: experiments_of(
             model, cut(model, signals, length), judged=False, zeros=shifted, known_start=known_start
         ),
         free_of(model, free), undecided=undecided(records, hold), starts=starts, progress=progress,
     )  # fmt: skip
-    determined = determinacy(best, runs)
+    determined = determinacy(best)
     result = Identification(
         model=with_origin(
-            best.model, [e.record for e in runs], determined.names, determined.intervals,
-            force_scale="given", interrupted=best.interrupted,
+            best.model, [e.record for e in best.experiments], determined.names,
+            determined.intervals, force_scale="given", interrupted=best.interrupted,
         ),
         fit=best,
         determinacy=determined,
-        experiments=runs,
         doubts=(),
         starts=outcomes,
         interrupted=best.interrupted,
@@ -85,9 +84,9 @@ def identify_ode(
     doubts = (
         *doubts_of(best, determined, outcomes),
         *_of_outputs(result),
-        *column_notes(model, runs),
+        *column_notes(model, best.experiments),
     )
-    noise = () if best.interrupted else noise_found(best, runs, signals)
+    noise = () if best.interrupted else noise_found(best, signals)
     return replace(result, doubts=doubts, notes=(*notes, *notes_of(noise)), noise_kinds=noise)
 
 

@@ -653,7 +653,7 @@ def identify_by_paper(
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
         doubts, result = (*doubts, note("runs_away")), ()
-    nothing = determinacy(best, experiments)
+    nothing = determinacy(best)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
     notes = (*model.provenance.notes, str(note("paper", names=result)))
     provenance = replace(model.provenance, notes=notes)
@@ -661,7 +661,6 @@ def identify_by_paper(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,
-        experiments=experiments,
         doubts=doubts,
         read_off=result,
     )

@@ -48,8 +48,8 @@ _GROWTH = 1000.0
 
 #: The experiments of records in parts of a number of samples, or whole (None).
 Made = Callable[[int | None], tuple[Experiment, ...]]
-#: A fit, its experiments, the outcome of every start, and notes.
-Fitted = tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...], tuple[Note, ...]]
+#: A fit, the outcome of every start, and notes.
+Fitted = tuple[Fit, tuple[StartOutcome, ...], tuple[Note, ...]]
 
 
 def ways(
@@ -74,32 +74,34 @@ def ways(
     dear = begins_once(model)
     from_several = 1 if dear else starts
     try:
-        best, whole, outcomes = search_starts(
+        best, outcomes = search_starts(
             sized(model, runs), runs, free, starts=from_several, progress=progress
         )
     except SimulationError as error:
         lost = error
     else:
-        done = best.interrupted or settled(best, whole)
-        usable = done or (follows(best, whole, _LOST) and not _grows(best, whole))
+        done = best.interrupted or settled(best)
+        usable = done or (follows(best, _LOST) and not _grows(best))
         if usable:
             # what a model lacks may look like a delay of half a sample; the search decides again
-            open_hold = undecided and (follows(best, whole) or not dear)
-            fit_read, read, notes = read_otherwise(best, whole, undecided=open_hold)
-            yield fit_read, read, outcomes, notes
+            open_hold = undecided and (follows(best) or not dear)
+            fit_read, notes = read_otherwise(best, undecided=open_hold)
+            yield fit_read, outcomes, notes
         if done:
             return
     progress("fitting parts of the records")
-    if dear and lost is None and follows(best, whole, NEAR):
+    if dear and lost is None and follows(best, NEAR):
         starts = 1
     result = _in_parts(model, signals, made, free, undecided, starts, progress)
-    if result is not None and (lost or len(result[1]) > len(whole) or _nearer(result[0], best)):
+    if result is not None and (
+        lost or len(result[0].experiments) > len(runs) or _nearer(result[0], best)
+    ):
         yield result
     elif lost is not None:
         raise lost
     elif not usable:
-        best, whole, notes = read_otherwise(best, whole, undecided=undecided)
-        yield best, whole, outcomes, notes
+        best, notes = read_otherwise(best, undecided=undecided)
+        yield best, outcomes, notes
 
 
 def _nearer(one: Fit, other: Fit) -> bool:
@@ -108,10 +110,10 @@ def _nearer(one: Fit, other: Fit) -> bool:
     return sum(float(np.log(a.rms / max(b.rms, 1e-300))) for a, b in pairs if a.rms > 0) < 0.0
 
 
-def follows(of: Fit, experiments: Sequence[Experiment], share: float = _FOLLOWED) -> bool:
+def follows(of: Fit, share: float = _FOLLOWED) -> bool:
     """Whether a model follows every output of the records, but for a small share or its noise."""
     for o in of.channels:
-        measured = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in experiments])
+        measured = np.concatenate([e.measured(o.number)[e.at(o.number)] for e in of.experiments])
         noise = np.repeat([first_order_noise(p)[0] if p.size else 0.0 for p in o.parts], o.lengths)
         least = EXCESSIVE * float(np.sqrt(np.mean(noise**2)))
         if o.rms > max(share * float(np.std(measured)), least):
@@ -131,25 +133,23 @@ def _in_parts(
     shortest = _shortest(model, signals, made, free, starts, progress)
     if shortest is None:
         return None
-    (best, parts, outcomes), length = shortest
-    best, parts, notes = read_otherwise(best, parts, undecided=undecided)
-    hold, longest = parts[0].record.hold, max(s.n for s in signals)
+    (best, outcomes), length = shortest
+    best, notes = read_otherwise(best, undecided=undecided)
+    hold, longest = best.experiments[0].record.hold, max(s.n for s in signals)
     progress("fitting longer parts")
-    best, parts, reached = _longest(
-        best, parts, lambda n: read_like(made(n), hold, notes), length, longest
-    )
+    best, reached = _longest(best, lambda n: read_like(made(n), hold, notes), length, longest)
     if reached is not None:
-        if begins_once(model) or forgets(best, parts):
+        if begins_once(model) or forgets(best):
             return None
         lasts = reached * float(np.median([s.sample_time for s in signals]))
-        notes = (*notes, note("in_parts", parts=len(parts), lasts=(lasts, "s")))
-    return *levelled(best, parts), outcomes, notes
+        notes = (*notes, note("in_parts", parts=len(best.experiments), lasts=(lasts, "s")))
+    return levelled(best), outcomes, notes
 
 
 def _shortest(
     model: Model, signals: Sequence[Signals], made: Made, free: Sequence[str], starts: int,
     progress: Progress,
-) -> tuple[tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]], int] | None:  # fmt: skip
+) -> tuple[tuple[Fit, tuple[StartOutcome, ...]], int] | None:  # fmt: skip
     """Return the search in short parts, shorter ones where a model does not follow, and samples."""
     most = _LEAST if begins_once(model) else _MOST
     finest = max(_FEWEST, -(-sum(s.n for s in signals) // most))
@@ -165,27 +165,24 @@ def _shortest(
             continue
         if result[0].interrupted:
             return None
-        if follows(*result[:2]):
+        if follows(result[0]):
             return result, length
     return None
 
 
-def _longest(
-    best: Fit, parts: tuple[Experiment, ...], made: Made, length: int, longest: int
-) -> tuple[Fit, tuple[Experiment, ...], int | None]:
+def _longest(best: Fit, made: Made, length: int, longest: int) -> tuple[Fit, int | None]:
     """Return the fit of the longest parts that a model follows, and their samples; None: whole."""
     reached: int | None = length
     while reached is not None:
         double = 2 * reached if 4 * reached <= longest else None
-        longer = made(double)
         try:
-            again = fit_longer_parts(best, parts, longer)
+            again = fit_longer_parts(best, made(double))
         except PsaError:
             break
-        if again.interrupted or not follows(again, longer) or _grows(again, longer):
+        if again.interrupted or not follows(again) or _grows(again):
             break
-        best, parts, reached = again, longer, double
-    return best, parts, reached
+        best, reached = again, double
+    return best, reached
 
 
 def begins_once(model: Model) -> bool:
@@ -209,9 +206,9 @@ def cut(model: Model, signals: Sequence[Signals], length: int | None) -> list[Si
     return result
 
 
-def fit_longer_parts(of: Fit, parts: Sequence[Experiment], longer: Sequence[Experiment]) -> Fit:
+def fit_longer_parts(of: Fit, longer: Sequence[Experiment]) -> Fit:
     """Fit longer parts from the end of a fit of shorter ones. Raises SimulationError."""
-    known = {_place(e): start for e, start in zip(parts, of.starts(), strict=True)}
+    known = {_place(e): start for e, start in zip(of.experiments, of.starts(), strict=True)}
     starts: list[Mapping[str, float]] = [known.get(_place(e), {}) for e in longer]
     sigma = [of.sigma[0]] * len(longer)
     return fit(
@@ -224,13 +221,13 @@ def _place(e: Experiment) -> tuple[str, float]:
     return e.record.sha256, float(e.record.time[0])
 
 
-def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
+def _influences(of: Fit) -> Iterator[FloatArray]:
     """Yield what outputs depend on the first states of every part (3, outputs).
 
     The largest derivative by a usual size of any state, in the first tenth of the part, in all of
     it, and in its last tenth.
     """
-    for k, p in enumerate(of.predictions(parts, further=True)):
+    for k, p in enumerate(of.predictions(further=True)):
         starts = slice(of.unknowns.first(k), of.unknowns.first(k + 1) - 1)
         each = [p.further[o.channel.outputs[0]][1][:, starts] for o in of.channels]
         size = np.max(np.abs(each), axis=2, initial=0.0)
@@ -239,25 +236,23 @@ def _influences(of: Fit, parts: Sequence[Experiment]) -> Iterator[FloatArray]:
         yield np.maximum([np.max(q, axis=1) for q in spans], 1e-300)
 
 
-def settled(of: Fit, experiments: Sequence[Experiment]) -> bool:
+def settled(of: Fit) -> bool:
     """Whether a model follows the records, or comes near and forgets how they began."""
-    if follows(of, experiments):
-        return True
-    return follows(of, experiments, NEAR) and forgets(of, experiments)
+    return follows(of) or (follows(of, NEAR) and forgets(of))
 
 
-def _grows(of: Fit, parts: Sequence[Experiment]) -> bool:
+def _grows(of: Fit) -> bool:
     """Whether an error at the beginning of a part grows too much in it."""
-    return any(np.max(whole / first) > _GROWTH for first, whole, _ in _influences(of, parts))
+    return any(np.max(whole / first) > _GROWTH for first, whole, _ in _influences(of))
 
 
-def forgets(of: Fit, parts: Sequence[Experiment]) -> bool:
+def forgets(of: Fit) -> bool:
     """Whether the outputs depend less and less on the states that records began with.
 
     What is left of the influence at the end of a record is the product of what is in its parts.
     """
     left = dict[str, float]()
-    for e, (first, _, last) in zip(parts, _influences(of, parts), strict=True):
+    for e, (first, _, last) in zip(of.experiments, _influences(of), strict=True):
         change = float(np.log(np.max(last / first)))
         left[e.record.sha256] = left.get(e.record.sha256, 0.0) + change
     return max(left.values()) < float(np.log(_FORGOTTEN))

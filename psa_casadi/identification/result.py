@@ -55,7 +55,6 @@ class Identification(Reported):
     model: Model
     fit: Fit
     determinacy: Determinacy
-    experiments: tuple[Experiment, ...]
     doubts: tuple[Note | str, ...]
     starts: tuple[StartOutcome, ...] = ()
     notes: tuple[Note | str, ...] = ()
@@ -65,6 +64,11 @@ class Identification(Reported):
     def __repr__(self) -> str:
         """Return the parameters with their standard errors, and what is left of the outputs."""
         return str(note("own_identification", identification=self))
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The records as they were fitted."""
+        return self.fit.experiments
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -89,7 +93,7 @@ class Identification(Reported):
     @cached_property
     def rms(self) -> Mapping[str, float]:
         """What is left of every measured output over all records (rms), in its unit."""
-        return residual_rms(self.fit, self.experiments)
+        return residual_rms(self.fit)
 
     @cached_property
     def noise(self) -> Mapping[str, float]:
@@ -129,12 +133,12 @@ class Identification(Reported):
         return json_text(self.to_dict())
 
 
-def residual_rms(fit: Fit, experiments: Sequence[Experiment]) -> dict[str, float]:
+def residual_rms(fit: Fit) -> dict[str, float]:
     """Return what a fit leaves of every measured output over all records (rms), in its unit."""
     table = {}
     for o in fit.channels:
         rows = zip(o.records, o.parts, strict=True)
-        left = np.concatenate([p * experiments[k].share(o.number) for k, p in rows])
+        left = np.concatenate([p * fit.experiments[k].share(o.number) for k, p in rows])
         table[o.column] = float(np.sqrt(np.mean(left**2)))
     return table
 
@@ -182,9 +186,7 @@ def with_origin(
     return replace(model, provenance=provenance, evidence=None)
 
 
-def noise_found(
-    fit: Fit, experiments: Sequence[Experiment], arguments: Sequence[Record | Signals] = ()
-) -> tuple[NoiseFound, ...]:
+def noise_found(fit: Fit, arguments: Sequence[Record | Signals] = ()) -> tuple[NoiseFound, ...]:
     """Return the kinds of noise in every output of every record, fitted and held-out samples.
 
     The noise is that of the samples as they were measured, not of averages or without outliers; the
@@ -192,7 +194,7 @@ def noise_found(
     once more. Raises SimulationError where it cannot be.
     """
     result = list[NoiseFound]()
-    for e, predicted in zip(experiments, fit.predicted_channels(experiments), strict=True):
+    for e, predicted in zip(fit.experiments, fit.predicted_channels(), strict=True):
         times = e.record.time
         whole = next((r for r in arguments if _holds(r, e)), e.record)
         inside = (whole.time >= times[0]) & (whole.time <= times[-1])

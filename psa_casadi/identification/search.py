@@ -138,7 +138,7 @@ def _search(
     ranked = _quick_fits(model, experiments, [*core, *mechanics], starts, progress, keep)
     first = ranked[0][1]
     keep(first)
-    sigma = residual_noise(first, experiments)
+    sigma = residual_noise(first)
     polished: dict[str, Fit] = {}
     for name, quick in ranked:
         near = quick.data_cost < (_NEAR if thorough else _CLOSE) * first.data_cost
@@ -147,34 +147,31 @@ def _search(
         stopped = any(f.interrupted for f in polished.values())
         if polished and (stopped or not (misfit or (near and len(polished) < 2))):
             break
-        if polished and not thorough and same_place(first, quick, experiments):
+        if polished and not thorough and same_place(first, quick):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
+        ended = quick if quick.interrupted else refit_or_keep(quick, sigma=sigma)
         polished[name] = ended
         keep(min(polished.values(), key=lambda f: f.data_cost))
     top = best = min(polished.values(), key=lambda f: f.data_cost)
     if not best.interrupted:
-        best = with_fast(best, experiments, progress)
-        tuned = retuned(best, experiments, progress) if mechanics else best
+        best = with_fast(best, progress)
+        tuned = retuned(best, progress) if mechanics else best
         if tuned is not best:
             top = best = tuned
         keep(best)
-        best = without_blur(best, experiments)
+        best = without_blur(best)
         keep(best)
-    outcomes, not_unique = _outcomes(ranked, polished, top, experiments)
+    outcomes, not_unique = _outcomes(ranked, polished, top)
     if thorough and not best.interrupted:
-        best, open_ones = exchanged(best, experiments, progress)
+        best, open_ones = exchanged(best, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names
     return Search(best, outcomes, tuple(n for n in names if n in not_unique))
 
 
 def _outcomes(
-    ranked: Sequence[tuple[str, Fit]],
-    polished: Mapping[str, Fit],
-    best: Fit,
-    experiments: Sequence[Experiment],
+    ranked: Sequence[tuple[str, Fit]], polished: Mapping[str, Fit], best: Fit
 ) -> tuple[tuple[StartOutcome, ...], set[str]]:
     """Return the outcome of every start, and the parameters in which equally good fits differ."""
     outcomes, not_unique = [], set[str]()
@@ -183,7 +180,7 @@ def _outcomes(
         if final is None:
             outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
-        names = differing(best, final, experiments)
+        names = differing(best, final)
         agrees = final is best or (names == () and equal(best, final))
         not_unique |= set(names)
         outcomes.append(StartOutcome(name, final.data_cost, final.rms, agrees))
@@ -265,7 +262,7 @@ def search_forms(
     samples = [int(e.used.sum()) for e in experiments]
 
     def criterion(s: Search) -> float:
-        levels = record_rms(s.best, experiments)
+        levels = record_rms(s.best)
         likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
         return float(likely + len(s.best.unknowns.names) * np.log(sum(samples)))
 
@@ -324,7 +321,7 @@ def loads_as_curves(
         record = replace(e.record, displacement=scaled, load_force=None)
         as_displacement.append(replace(e, record=record).with_further(()))
     predictions = [
-        fit_base(start, others, progress=progress).predicted(others)
+        fit_base(start, others, progress=progress).predicted()
         for others in (unloaded, tuple(as_displacement))
     ]
     curves = [_curve(load, x) for load, *x in zip(loads, *predictions, strict=True)]

@@ -22,7 +22,7 @@ from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.multistart import free_of
 from psa_casadi.identification.own_model import identify_ode
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
-from psa_casadi.identification.refitting import noise_levels, weighted
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
@@ -230,7 +230,7 @@ def own_task_of(
     declared = {n: fitted.parameter(n).value for n in names}
     return _around(
         fitted.with_values({**declared, **(prior or {})}),
-        weighted(identification.fit, identification.experiments),
+        identification.experiments,
         {n: fitted.values[n] for n in names},
         widths or {},
         identification.fit.sigma,

@@ -10,7 +10,7 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.pack import STACK, Task
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
@@ -38,7 +38,7 @@ def test_bends_are_alike_where_no_resonance_shows(
     displayed = simulate(model, time, voltage).displacement
     experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
     result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
-    groups = Task(experiments, TABLE, STACK).indistinguishable(result)
+    groups = Task(TABLE, STACK).indistinguishable(result)
     assert tuple(tuple(sorted(group)) for group in groups) == alike
 
 
@@ -56,7 +56,7 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     assert cause.confidence == pytest.approx(one, rel=1e-3)
     assert one == pytest.approx(other, rel=1e-3)
     assert "no voltage below the resonances separates" in result.next_experiment.why
-    output, _ = one_of_each(result.contenders, result.experiments)
+    output, _ = one_of_each(result.contenders)
     assert len(output) == 1
     with pytest.raises(InputError, match="bend the same curve"):
         resolving_experiment(result)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import sawtooth
 
-from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out import Gain
+from psa_casadi.diagnosis.held_out import Gain, coverage_notes, unconfirmed
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.identification.start.doubts import doubtful_quantity
 from psa_casadi.model.effects import EFFECTS

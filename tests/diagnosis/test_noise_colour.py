@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.colour import Colour, colour_of, left_correlation
-from psa_casadi.diagnosis.omnibus import omnibus
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
+from psa_casadi.diagnosis.colour import Colour, OwnColour, colour_of, left_correlation, own_colour
+from psa_casadi.diagnosis.noise import omnibus
 from psa_casadi.records.noise import first_order_noise, uncertain
 from tests.studies.plants.noise import coloured
 from tests.tiers import slow_but

@@ -28,5 +28,5 @@ def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
     place = float(x.min() + share * np.ptp(x))
     reading = x + 2e-8 * (x > place) + noise + 3e-6
     experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=reading)),)
-    places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
+    places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]))
     assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)

@@ -88,7 +88,7 @@ def test_what_the_device_adds_is_predicted_where_the_voltage_is_another() -> Non
         records.append(psa.Record(name="r", time=time, voltage=v, displacement=displayed))
     experiments = (whole(records[0]),)
     held = fit(model, experiments, (), sigma=[1e-7])
-    healthy = Healthy(held, experiments)
+    healthy = Healthy(held)
     (added,), places = healthy.adds(records[1:])
     observed = healthy.shows(records[1])
     assert places == 0

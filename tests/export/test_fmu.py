@@ -12,8 +12,7 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.generic.attached import extended
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.export.check.agreement import has_reference
 from psa_casadi.export.check.check import as_exported
 from psa_casadi.export.check.description import wrong_dependencies, wrong_start_values

@@ -230,9 +230,8 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     assert shorter.n < record.n
     result = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
     output = evidence_of(
-        result, determinacy(result, (whole(shorter),)), (whole(shorter),),
-        result.predicted((whole(shorter),)), by="test", sampled=[record],
-    )  # fmt: skip
+        result, determinacy(result), result.predicted(), by="test", sampled=[record]
+    )
     model = replace(result.model.plant(), evidence=replace(output, reference=None))
     with Archive(evident_fmu()) as archive:
         again = repeated(archive, model, [record])

@@ -16,8 +16,7 @@ import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.common.children import end_children
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.generic.attached import extended
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
 from psa_casadi.export.importer.masters import Signals

@@ -37,4 +37,4 @@ def loops(name: str) -> tuple[Fit, tuple[Experiment, ...], Determinacy]:
     experiments = tuple(whole(r) for r in records)
     sigma = [NOISE * r.range_m for r in records]
     result = fit(model, experiments, FREE, sigma=sigma)
-    return result, experiments, determinacy(result, experiments)
+    return result, experiments, determinacy(result)

@@ -15,7 +15,8 @@ from tests.tiers import slow_but
 
 
 def advised(name: str) -> tuple[Advice, ...]:
-    return advice(*loops(name))
+    result, _, determined = loops(name)
+    return advice(result, determined)
 
 
 def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
@@ -32,8 +33,8 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
     ringing, last = results[-2:]
     assert ringing.sentence.startswith("If the mechanics ring, m_P and m_B would be determined")
     assert (last.kind, last.record) == ("force", None)
-    result, experiments, determined = loops("PTBS200")
-    advices = advice(result, experiments, determined, force_scale_given=True)
+    result, _, determined = loops("PTBS200")
+    advices = advice(result, determined, force_scale_given=True)
     assert [a.sentence for a in advices] == [a.sentence for a in results[:-1]]
 
 
@@ -56,7 +57,7 @@ def test_following_the_advice_determines_what_it_promises(name: str) -> None:
     both = [*experiments, *new]
     sigma = [*result.sigma, *[result.sigma[0]] * len(new)]
     again = fit(model, both, tuple(dict.fromkeys([*FREE, *promised])), sigma=sigma)
-    after = determinacy(again, both)
+    after = determinacy(again)
     assert not set(promised) & set(after.undetermined)
     for n in promised:
         error = after.standard_errors[n]
@@ -72,9 +73,9 @@ def test_what_no_record_can_tell_is_said() -> None:
     record = measured(model, "loop", time, voltage, 3)
     experiments = [whole(record)]
     result = fit(model, experiments, ("k_L", "R_s", "C_p"), sigma=[NOISE * record.range_m])
-    determined = determinacy(result, experiments)
+    determined = determinacy(result)
     assert {"R_s", "C_p"} == set(determined.undetermined)
-    results = advice(result, experiments, determined)
+    results = advice(result, determined)
     nothing = [a for a in results if a.sentence.startswith("None of the ")]
     assert len(nothing) == 1
     assert set(determined.undetermined) <= set(nothing[0].parameters)

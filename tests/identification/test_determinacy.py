@@ -133,10 +133,10 @@ def test_what_is_determined_or_free_by_itself_has_no_formula() -> None:
 @pytest.mark.parametrize("samples", [20, 90, 400])
 def test_slow_residuals_leave_no_negative_variance(samples: int) -> None:
     """Of residuals that swing slowly the correlation, cut off at its last lag, is none."""
-    result, experiments, _ = loops("P-885.51")
+    result, _, _ = loops("P-885.51")
     count = len(result.residuals)
     slow = result.sigma[0] * np.sin(2.0 * np.pi * np.arange(count) / samples)
-    covariance = covariance_of(replace(result, residuals=slow), experiments)
+    covariance = covariance_of(replace(result, residuals=slow))
     sizes = np.linalg.eigvalsh(covariance)
     assert sizes[0] >= -1e-9 * sizes[-1]
     assert np.all(np.diag(covariance) > 0.0)

@@ -63,7 +63,7 @@ def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
     experiments = [whole(regular())]
     result = fitted(experiments, SIGMA)
     fine = simulated_by(result, experiments, Way(1e-10, 1e-10, stepped=True))
-    gap = float(np.sqrt(np.mean((result.predicted(experiments)[0] - fine) ** 2)))
+    gap = float(np.sqrt(np.mean((result.predicted()[0] - fine) ** 2)))
     limit = allowed(experiments[0], SIGMA)
     assert gap <= limit
     assert gap <= 3.0 * result.simulated[0].errors[0] + 0.03 * limit
@@ -71,7 +71,7 @@ def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
 
 def simulated_by(fit: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
     """Return the prediction (n,) of the first record on another way."""
-    return replace(fit, way=way).predicted(experiments)[0]
+    return replace(fit, way=way).predicted()[0]
 
 
 @pytest.mark.parametrize("sigma", [1e-9, 1e-12])
@@ -82,7 +82,7 @@ def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None
     limit = allowed(experiments[0], sigma)
     assert output.way == STEPPER or output.errors[0] <= limit
     fine = simulated_by(result, experiments, Way(1e-11, 1e-11, stepped=True))
-    gap = result.predicted(experiments)[0] - fine
+    gap = result.predicted()[0] - fine
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit
 
 

@@ -31,7 +31,7 @@ from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, coars
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
@@ -409,7 +409,7 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    contenders, _ = one_of_each(d.contenders, d.experiments)
+    contenders, _ = one_of_each(d.contenders)
     if len(contenders) < 2 or (limits is not None and not _slow(limits)):
         contenders = d.contenders  # a new record that shows resonances may separate them
     contenders = tuple(sorted(contenders, key=lambda c: -c.evidence)[:_RIVALS])

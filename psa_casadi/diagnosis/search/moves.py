@@ -56,7 +56,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             return None
         left = measured(e.record)[part] - before.predicted[k][part]
         shaken.append(Response(e.record.sample_time, drive[part], left, e.used[part]))
-        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
+        free.append(before.fit.jacobian[before.fit.parts[k]][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
     fit, states = before.fit, tuple(before.fit.starts())
     while len(modes) >= FEWEST:
@@ -67,12 +67,12 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             for name, value in asdict(mode).items()
         }
         added = [(effect, values, 1.0)]
-        result = fits.fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        result = fits.fit_with_all(fit, added, states, {}, _EVALUATIONS)
         if result is None:
             return None
         ringing = [m for m in _modes(result, len(modes)) if m.damping < MOST_DAMPED]
         if len(ringing) == len(modes):
-            return hypothesis((*before.causes, effect), result, experiments)
+            return hypothesis((*before.causes, effect), result)
         base = result.model.without([effect.name])
         modes, states = ringing, tuple(result.starts())
         fit = replace(before.fit, model=base)

@@ -10,8 +10,8 @@ import numpy as np
 from psa_casadi.common.files import atomic_write
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
+from psa_casadi.diagnosis.remedy import Signature, signature
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.diagnosis.signature import Signature, signature
 from psa_casadi.identification import grades
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile

@@ -16,8 +16,8 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_path
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.linear import Linear
+from psa_casadi.diagnosis.remedy import Signature
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.component import Component

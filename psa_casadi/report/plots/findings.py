@@ -6,10 +6,9 @@ import numpy as np
 
 from psa_casadi.common.units import FloatArray, convert
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
-from psa_casadi.diagnosis.misfit import Misfit, Spectrum
+from psa_casadi.diagnosis.misfit import Misfit, Spectrum, View
+from psa_casadi.diagnosis.remedy import Signature
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
-from psa_casadi.diagnosis.signature import Signature
-from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.grades import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.result import Identification

@@ -149,13 +149,13 @@ def series_of_fit(identification: Identification) -> tuple[Series, ...]:
     """
     rows: list[Series] = []
     if isinstance(identification, StackIdentification):
-        predictions = identification.fit.predicted(identification.experiments)
+        predictions = identification.fit.predicted()
         rows_of = zip(identification.experiments, predictions, strict=True)
         for k, (e, predicted) in enumerate(rows_of):
             noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
             rows.append(_displacement(k, e, [Curve("model", colours.EXTENDED, predicted)], noise))
         return tuple(rows)
-    outputs = identification.fit.outputs(identification.experiments)
+    outputs = identification.fit.outputs()
     for j, channel in enumerate(identification.experiments[0].channels):
         place = identification.model.output_names.index(channel.column)
         for k, y in enumerate(outputs):

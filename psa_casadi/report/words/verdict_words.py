@@ -5,8 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from psa_casadi.diagnosis.corrections import Correction, Patch
-from psa_casadi.diagnosis.families import Family
+from psa_casadi.diagnosis.corrections import Correction, Family, Patch
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
 from psa_casadi.diagnosis.result import (
     Alternative,
