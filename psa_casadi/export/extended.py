@@ -16,7 +16,7 @@ from psa_casadi.common.files import atomic_path, temporary_folder
 from psa_casadi.export import ssp
 from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION
-from psa_casadi.export.importer.played import GIVEN, PLAYED
+from psa_casadi.export.importer.played import GIVEN, PLAYED, RUNS
 from psa_casadi.export.importer.start_values import FmuPart, fmu_part, start_set
 from psa_casadi.export.nested import nested
 from psa_casadi.model.component import Component, Equations, OnDemand, Symbols
@@ -177,5 +177,5 @@ def _first_outputs(part: FmuPart) -> list[float]:
         return [0.0 for _ in component.outputs]
     stepped = replace(played, interface=CO_SIMULATION)  # as what holds it steps it
     starts = np.array([[i.start for i in component.inputs]])
-    (outputs,) = stepped.outputs_of([(part.model.values, starts)], np.zeros(1), "zero", 1)
+    (outputs,) = RUNS.of([stepped.play(part.model.values, np.zeros(1), starts, "zero")])
     return [float(v) for v in outputs[0]]

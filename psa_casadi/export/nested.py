@@ -113,7 +113,7 @@ def _config(
         return archives[port.part].references[wiring.called(port)]
 
     parts = [
-        f'{{"{n}", "{a.identifier}", "{a.token}", {int(_takes_lines(a))}}}'
+        f'{{"{n}", "{a.identifier}", "{a.token}", {int(a.takes_lines)}}}'
         for n, a in archives.items()
     ]
     wires = [
@@ -161,10 +161,6 @@ def config_text(
     )
 
 
-def _takes_lines(archive: Archive) -> bool:
-    return bool(archive.description.coSimulation.canInterpolateInputs)
-
-
 def _description(
     wiring: WiredParts, archives: Mapping[str, Archive], listed: list[_Shown], token: str
 ) -> bytes:
@@ -197,7 +193,7 @@ def _description(
                 a.description.coSimulation.canHandleVariableCommunicationStepSize
                 for a in archives.values()
             ),
-            canInterpolateInputs="before" in archives or _takes_lines(archives["original"]),
+            canInterpolateInputs="before" in archives or archives["original"].takes_lines,
         ),
         modelVariables=variables, outputs=outputs, initialUnknowns=outputs,
     )  # fmt: skip

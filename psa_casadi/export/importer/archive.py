@@ -244,6 +244,10 @@ class Archive:
         kinds = ((1, self.description.coSimulation), (0, self.description.modelExchange))
         return tuple(kind for kind, announced in kinds if announced is not None)
 
+    def kind(self, interface: int) -> Any:
+        """Return what the description states of co-simulation (1) or model exchange (0)."""
+        return (self.description.modelExchange, self.description.coSimulation)[interface]
+
     def experiment(self, name: str) -> float:
         """Return a number of the default experiment by fmpy's name, 0 if there is none."""
         return float(getattr(self.description.defaultExperiment, name, None) or 0.0)
@@ -252,6 +256,11 @@ class Archive:
     def internal_step(self) -> float:
         """The fixed internal step of co-simulation [s], 0 if there is none."""
         return float(getattr(self.description.coSimulation, "fixedInternalStepSize", None) or 0.0)
+
+    @property
+    def takes_lines(self) -> bool:
+        """Whether the slope of an input over a step can be set in co-simulation."""
+        return bool(getattr(self.description.coSimulation, "canInterpolateInputs", False))
 
     @property
     def token(self) -> str:

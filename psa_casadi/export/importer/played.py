@@ -10,7 +10,6 @@ for each, and none for effects of outputs. What was run once is not run again.
 import atexit
 import hashlib
 import threading
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
@@ -27,7 +26,7 @@ from psa_casadi.common.processes import Processes
 from psa_casadi.common.symbolic import in_turn
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.fmu import CO_SIMULATION
-from psa_casadi.export.importer.play import Run, play
+from psa_casadi.export.importer.masters import Run, Signals, play
 from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.model.ports import Opened, ported
@@ -71,38 +70,27 @@ class Played:
     parameters: tuple[tuple[str, str], ...]
     fixed: tuple[tuple[str, float], ...]
 
-    def outputs_of(
-        self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str,
-        parts: int,
-    ) -> list[FloatArray]:  # fmt: skip
-        """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
-
-        Each step of co-simulation is divided into `parts`. Raises SimulationError with the
-        FMU's message.
-        """
-        return RUNS.of([self._of(values, u, t, hold, parts) for values, u in wanted])
-
-    def _of(
-        self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str, parts: int
+    def play(
+        self, values: Mapping[str, float], t: FloatArray, u: FloatArray, hold: str, parts: int = 1
     ) -> Run:
+        """Return a run with values of parameters and inputs (n, nu), each step in `parts`."""
         starts = {**dict(self.fixed), **{n: values[name] for name, n in self.parameters}}
-        fmu = self.file, self.digest, self.interface, self.inputs, self.outputs
-        return Run(*fmu, starts, t, u, hold, parts)
+        inputs = Signals(self.inputs, t, u, hold == "zero")
+        return Run(self.file, self.digest, self.interface, self.outputs, starts, inputs, parts)
 
-    def _parts(self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str) -> int:
-        """Return into how many parts a step of co-simulation is divided with these inputs.
+    def _parts(self, run: Run) -> int:
+        """Return into how many parts a step of co-simulation is divided with the inputs of a run.
 
         It is decided once for a record, at the first values: as many as it takes until twice as
         many change no output by more than a small share of its standard deviation.
         """
         if self.interface != CO_SIMULATION:
             return 1
-        key = _key(self._of(dict.fromkeys(values, 0.0), u, t, hold, 1))
+        key = _key(replace(run, values=dict(self.fixed)))
         if key not in _PARTS:
-            parts = 1
-            (before,) = RUNS.of([self._of(values, u, t, hold, parts)])
+            parts, (before,) = 1, RUNS.of([run])
             while parts < _MOST_PARTS:
-                (after,) = RUNS.of([self._of(values, u, t, hold, 2 * parts)])
+                (after,) = RUNS.of([replace(run, parts=2 * parts)])
                 size = np.maximum(np.std(after, axis=0), 1e-300)
                 if np.max(np.sqrt(np.mean((after - before) ** 2, axis=0)) / size) < _SETTLED:
                     break
@@ -154,15 +142,16 @@ class Played:
         ]
         steps = {k: _step(inner, unknowns[k], at) for k in moved}
 
-        def changed(k: int, side: int) -> tuple[Mapping[str, float], FloatArray]:
-            """Return values and inputs with a step of an unknown to one side."""
+        parts = self._parts(self.play(at, t, u, kept))
+
+        def changed(k: int, side: int) -> Run:
+            """Return the run with a step of an unknown to one side."""
             q, h = unknowns[k], side * steps[k]
             new = {**at, q: at[q] + h} if isinstance(q, str) else at
-            return new, applied + h * before.sensitivity[:, :, k]
+            return self.play(new, t, applied + h * before.sensitivity[:, :, k], kept, parts)
 
-        parts = self._parts(at, u, t, kept)
-        plain, *others = self.outputs_of(
-            [(at, applied), *(changed(k, 1) for k in moved)], t, kept, parts
+        plain, *others = RUNS.of(
+            [self.play(at, t, applied, kept, parts), *(changed(k, 1) for k in moved)]
         )
         result = around(plain, wanted, unknowns)
         rows = [names.index(n) for n in wanted]
@@ -172,7 +161,7 @@ class Played:
 
         slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
         jumping = [k for k in moved if _jumps(slopes[k])]
-        back = self.outputs_of([changed(k, -1) for k in jumping], t, kept, parts)
+        back = RUNS.of([changed(k, -1) for k in jumping])
         for k, y in zip(jumping, back, strict=True):
             slopes[k] = _lesser(slopes[k], slope(k, -1, y))
         sensitivity = result.sensitivity.copy()
@@ -293,7 +282,7 @@ class _Runs:
 
     def __init__(self) -> None:
         self.count = self.samples = 0
-        self._kept: OrderedDict[str, FloatArray | str] = OrderedDict()
+        self._kept: dict[str, FloatArray | str] = {}
         self._processes: Processes | None = None
         self._lock = threading.Lock()
 
@@ -311,10 +300,9 @@ class _Runs:
             self.end()
             raise
         with self._lock:
-            for key in new:
-                self._kept[key] = table[key]
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
+            self._kept |= {key: table[key] for key in new}
+            for key in list(self._kept)[:-_KEPT]:
+                del self._kept[key]
         outputs = []
         for key, _ in wanted:
             result = table[key]
@@ -324,7 +312,7 @@ class _Runs:
         return outputs
 
     def _submitted(self, wanted: Run) -> "Future[Any]":
-        self.count, self.samples = self.count + 1, self.samples + len(wanted.t)
+        self.count, self.samples = self.count + 1, self.samples + len(wanted.inputs.times)
         if self._processes is None:
             self._processes = Processes(threads(), again=True)
             atexit.register(self.end)
@@ -356,8 +344,9 @@ def _waited(future: "Future[Any]") -> FloatArray | str:
 
 
 def _key(r: Run) -> str:
-    what = (r.file, r.digest, r.interface, r.inputs, r.outputs, r.values, r.hold, r.parts)
-    return hashlib.sha256(repr(what).encode() + r.t.tobytes() + r.u.tobytes()).hexdigest()
+    i = r.inputs
+    what = (r.file, r.digest, r.interface, i.names, r.outputs, r.values, i.held, r.parts)
+    return hashlib.sha256(repr(what).encode() + i.times.tobytes() + i.values.tobytes()).hexdigest()
 
 
 RUNS = _Runs()
