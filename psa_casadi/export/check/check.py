@@ -128,7 +128,7 @@ def check_fmu(
             tool = str(archive.description.generationTool)
             foreign = model is None and not tool.startswith("psa_casadi")
         if foreign:
-            rows += [c.row() for c in described(archive, description.invalid)]
+            rows += [c.row() for c in described(archive)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
             rows += rows_apart(task, end)
             return CheckReport(path, tuple(rows), compared=False, foreign=True)

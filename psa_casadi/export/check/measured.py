@@ -1,21 +1,28 @@
 """The checks that touch the binaries of an FMU, in turn; their process may end in any of them."""
 
 import secrets
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check import structure
 from psa_casadi.export.check.agreement import Run, Truth
 from psa_casadi.export.check.binaries import binary_checks
 from psa_casadi.export.check.calls import CALLS
-from psa_casadi.export.check.foreign import foreign_checks
-from psa_casadi.export.check.rows import LEFT_OUT, LEFT_OUT3, Check, CheckRow, stopped
+from psa_casadi.export.check.foreign import by_standard, foreign_checks
+from psa_casadi.export.check.rows import (
+    BREAKDOWNS,
+    LEFT_OUT,
+    LEFT_OUT3,
+    Check,
+    CheckRow,
+    Findings,
+    stopped,
+)
 from psa_casadi.export.common.variable_table import INPUT_LINE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.archive import Archive
@@ -129,15 +136,18 @@ def checks_of(task: Task) -> Iterator[Check]:
 
     Without a model there is no truth, and nothing is compared with it.
     """
-    if task.foreign:
-        with Archive(task.path, task.unpacked) as archive:
-            yield from foreign_checks(partial(Fmu, task.path, task.unpacked), archive)
-        return
-    with Archive(task.path, task.unpacked) as archive:
-        yield from binary_checks(archive, portable=task.portable)
     loaded: list[Fmu] = []
-    yield Check("binary loads", partial(_load, task, loaded))
+    with Archive(task.path, task.unpacked) as archive:
+        load = partial(_load, task, archive, loaded)
+        if task.foreign:
+            yield by_standard("binary loads", load, archive.version)
+        else:
+            yield from binary_checks(archive, portable=task.portable)
+            yield Check("binary loads", load)
     for fmu in loaded:
+        if task.foreign:
+            yield from foreign_checks(fmu)
+            continue
         fixed = fixed_step_of(fmu.directory) is not None
         left_out = (*LEFT_OUT, *LEFT_OUT3) if fixed else ()
         for check in _of_fmu(fmu, task, loaded):
@@ -196,14 +206,15 @@ def _compared(fmu: Fmu, truth: Truth, run: Run) -> CheckRow:
     return CheckRow(run.name, largest, run.limit, largest <= run.limit, remark)
 
 
-def _load(task: Task, loaded: list[Fmu]) -> Iterator[str]:
+def _load(task: Task, archive: Archive, loaded: list[Fmu]) -> Iterator[str]:
     """Append the FMU with its binary; what prevents that is the problem."""
     try:
         fmu = Fmu(task.path, task.unpacked)
         for interface in fmu.interfaces():
             fmu.loaded(interface)
-    except InputError as error:
-        yield str(error)
+    except BREAKDOWNS as error:
+        folders = {p.parent.name for p in archive.binaries()}
+        yield f"{error} (it has {', '.join(sorted(folders)) or 'none'})"
     else:
         loaded.append(fmu)
 
@@ -221,7 +232,7 @@ _INTERFACES = {
     "co-simulation instantiates": CO_SIMULATION,
     "model exchange instantiates": MODEL_EXCHANGE,
 }
-_CALLS: dict[str, Callable[[Fmu], Iterable[str]]] = {
+_CALLS: dict[str, Callable[[Fmu], Findings]] = {
     **CALLS,
     "nominal values": structure.wrong_nominals,
     "event indicators": structure.event_indicators,

@@ -105,16 +105,28 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
     table: dict[str, set[str]] = {name: set() for name in unknowns}
     for instance, point in _at_points(fmu, 1):
-        here = evaluate(instance, point, unknowns)
-        for known in point:
-            moved = {**point, known: point[known] * 1.01}
-            changed = evaluate(instance, moved, unknowns) != here
-            for name in np.array(unknowns)[changed]:
-                table[name].add(known)
+        moved = {n: 1.01 * v for n, v in point.items()}
+        for name, known in movements(instance, point, unknowns, moved):
+            table[name].add(known)
     claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
     missing = {(name, known) for name, claimed in claims for known in table[name] - claimed}
     for name, known in sorted(missing):
         yield f"'{name}' depends on '{known}', which its dependencies do not list"
+
+
+def movements(
+    instance: Instance,
+    point: dict[str, float],
+    unknowns: list[str],
+    moved: Mapping[str, float],
+    rounding: float = 0.0,
+) -> Iterator[tuple[str, str]]:
+    """Yield unknown and known where a known that is moved from a point moves an unknown."""
+    here = evaluate(instance, point, unknowns)
+    for known, value in moved.items():
+        there = evaluate(instance, {**point, known: value}, unknowns)
+        for name in np.array(unknowns)[np.abs(there - here) > rounding * np.abs(here)]:
+            yield str(name), known
 
 
 def directional_error(fmu: Fmu) -> float:
