@@ -12,7 +12,7 @@ from itertools import chain
 import numpy as np
 
 from psa_casadi.common.units import FloatArray
-from psa_casadi.export.check.rows import Findings, Note
+from psa_casadi.export.check.rows import Findings, Remark
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
 
 #: Internal steps in one step, at most.
@@ -122,7 +122,7 @@ def several_instances(fmu: Fmu, rounding: float = 0.0) -> Findings:
     """Two instances in turn give what each gives alone, where several are allowed."""
     for interface in fmu.interfaces():
         if fmu.kind(interface).canBeInstantiatedOnlyOncePerProcess:
-            yield Note(f"{WORDS[interface]}: one instance for each process")
+            yield Remark(f"{WORDS[interface]}: one instance for each process")
         elif interface == CO_SIMULATION:
             size, alone = step_of(fmu), []
             for shares in (SHARES, SHARES[::-1]):
@@ -142,7 +142,7 @@ def saved_states(fmu: Fmu) -> Findings:
     """A state that is saved in a run and restored replays the same, also by way of bytes."""
     for interface in fmu.interfaces():
         if not fmu.kind(interface).canGetAndSetFMUstate:  # fmpy's name in FMI 3.0, too
-            yield Note(f"{WORDS[interface]}: it announces no way to save its state")
+            yield Remark(f"{WORDS[interface]}: it announces no way to save its state")
             continue
         with ready(fmu, interface) as instance:
             run_of(instance, SHARES[:2])

@@ -28,7 +28,7 @@ from psa_casadi.export.check.calls import (
     stepped,
 )
 from psa_casadi.export.check.description import invalid
-from psa_casadi.export.check.rows import Check, Findings, Note
+from psa_casadi.export.check.rows import Check, Findings, Remark
 from psa_casadi.export.check.structure import difference_error, movements
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
@@ -53,7 +53,7 @@ def units(archive: Archive) -> Findings:
     yield from (f"the unit '{u}' is not defined" for u in sorted({*stated.values()} - known))
     without = [n for n, e in archive.elements.items() if e.real and e.variable not in stated]
     if without:
-        yield Note(f"{len(without)} of {len(archive.elements)} numbers have no unit")
+        yield Remark(f"{len(without)} of {len(archive.elements)} numbers have no unit")
 
 
 def instances(fmu: Fmu) -> Findings:
@@ -73,7 +73,7 @@ def same_bits(fmu: Fmu) -> Findings:
             with ready(fmu, interface) as instance:
                 runs.append(run_of(instance))
         if off := difference(*runs):
-            yield Note(f"{WORDS[interface]}: a second instance is {off:.2g} off the first")
+            yield Remark(f"{WORDS[interface]}: a second instance is {off:.2g} off the first")
 
 
 def finite(fmu: Fmu) -> Findings:
@@ -82,7 +82,7 @@ def finite(fmu: Fmu) -> Findings:
         with ready(fmu, interface) as instance:
             wrong = ~np.isfinite(np.atleast_2d(run_of(instance))).all(axis=0)
         if wrong.any():
-            yield Note(f"{WORDS[interface]}: {int(wrong.sum())} numbers are not finite")
+            yield Remark(f"{WORDS[interface]}: {int(wrong.sum())} numbers are not finite")
 
 
 def memory(fmu: Fmu) -> Findings:
@@ -97,7 +97,7 @@ def memory(fmu: Fmu) -> Findings:
         if time.monotonic() > end and count > _WARM:
             break
     if not before:
-        yield Note("this system does not tell the memory of a process")
+        yield Remark("this system does not tell the memory of a process")
         return
     leak = max(0.0, float(_resident() - before)) / max(1, count - _WARM)
     yield leak
@@ -105,7 +105,7 @@ def memory(fmu: Fmu) -> Findings:
     if leak > _LEAK:
         yield text
     elif count < _CYCLES:
-        yield Note(text)
+        yield Remark(text)
 
 
 def _resident() -> int:
@@ -140,11 +140,11 @@ def derivatives(fmu: Fmu) -> Findings:
     """Directional derivatives of model exchange are those of differences, at two step sizes."""
     exchange = fmu.description.modelExchange
     if exchange is None or not exchange.providesDirectionalDerivative:
-        yield Note("it provides none")
+        yield Remark("it provides none")
         return
     unknowns = _unknowns(fmu)
     if any(fmu.elements[n].count > 1 for n in [*unknowns, *fmu.state_elements]):
-        yield Note("not looked at: arrays")
+        yield Remark("not looked at: arrays")
         return
     with _moved_point(fmu) as (instance, point):
         seed = {n: fmu.nominals[n] for n in point if n != "time"}
@@ -165,7 +165,7 @@ def dependencies(fmu: Fmu) -> Findings:
         if e.dependencies is not None and e.variable.name in wanted
     }
     if fmu.description.modelExchange is None or not table:
-        yield Note("none are told, or there is no model exchange to see them by")
+        yield Remark("none are told, or there is no model exchange to see them by")
         return
     with _moved_point(fmu) as (instance, point):
         moved = {n: v + 0.1 * fmu.nominals[n] for n, v in point.items() if n != "time"}
@@ -213,7 +213,7 @@ def values_taken(fmu: Fmu) -> Findings:
         if e.real and fmu.variables[e.variable].variability != "fixed" and low <= new <= high:
             moved[name] = new
     if not moved:
-        yield Note("nothing can be set")
+        yield Remark("nothing can be set")
         return
     with fmu.open(fmu.interfaces()[0]) as instance:
         instance.setup(values=moved)
@@ -224,7 +224,7 @@ def inputs_at_events(fmu: Fmu) -> Findings:
     """An input that is set in event mode has its value after the event."""
     inputs = moved_inputs(fmu, 0.1)
     if MODEL_EXCHANGE not in fmu.interfaces() or not inputs:
-        yield Note("it has no model exchange, or no inputs")
+        yield Remark("it has no model exchange, or no inputs")
         return
     with ready(fmu, MODEL_EXCHANGE) as instance:
         instance.require("EnterEventMode")
@@ -237,7 +237,7 @@ def inputs_at_events(fmu: Fmu) -> Findings:
 def step_sizes(fmu: Fmu) -> Findings:
     """Steps of any size are taken if the FMU announces it; a note has the effect of the size."""
     if CO_SIMULATION not in fmu.interfaces():
-        yield Note("it has no co-simulation")
+        yield Remark("it has no co-simulation")
         return
     size, internal, ends = step_of(fmu), fmu.internal_step, []
     for parts in (1, 2, 4):
@@ -249,7 +249,7 @@ def step_sizes(fmu: Fmu) -> Findings:
         scale = np.maximum(np.abs(ends[2]), 1e-300)
         offs = [float(np.max(np.abs(e - ends[2]) / scale, initial=0.0)) for e in ends[:2]]
         yield offs[0]
-        yield Note(
+        yield Remark(
             f"steps of {size:g} s end {offs[0]:.2g}, half ones {offs[1]:.2g} off quarter ones"
         )
     if fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
@@ -281,7 +281,7 @@ def speed(fmu: Fmu) -> Findings:
             count += 1
         each = (time.perf_counter() - begin) / max(1, count)
     what = f"a step of {size:g} s" if stepping else "an evaluation"
-    yield Note(f"{what} takes {1e6 * each:.3g} us, an instance {1e3 * made:.3g} ms")
+    yield Remark(f"{what} takes {1e6 * each:.3g} us, an instance {1e3 * made:.3g} ms")
 
 
 _DESCRIBED: dict[str, Callable[[Archive], Findings]] = {

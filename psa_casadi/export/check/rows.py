@@ -41,7 +41,7 @@ class CheckRow:
     noted: bool = False
 
 
-class Note(str):
+class Remark(str):
     """A remark on what is no violation."""
 
     __slots__ = ()
@@ -77,7 +77,7 @@ class Check:
                 if isinstance(item, float):
                     figure, limit = item, self.limit
                 else:
-                    (notes if isinstance(item, Note) else violations).append(str(item))
+                    (notes if isinstance(item, Remark) else violations).append(str(item))
         except BREAKDOWNS as error:
             violations.append(str(error) if foreign else f"the check stopped: {error}")
             if not foreign:

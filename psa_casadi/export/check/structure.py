@@ -8,6 +8,7 @@ import numpy as np
 
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import Truth
+from psa_casadi.export.check.calls import WORDS
 from psa_casadi.export.common.variable_table import INPUT_LINE, START_VOLTAGE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
@@ -220,7 +221,6 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
     That is at the start values of its states and inputs, with the outputs that follow from them.
     """
     for interface in fmu.interfaces():
-        kind = "co-simulation" if interface == CO_SIMULATION else "model exchange"
         with fmu.start(interface) as instance:
             result = instance.get(list(truth.starts))
         others = [
@@ -231,9 +231,9 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
         if others:
             name, there, value = next((o for o in others if o[0] == "voltage"), others[-1])
             yield (
-                f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}, and"
-                f" {len(others) - 1} more values differ; compare with the model that was exported,"
-                " with its --start-voltage and --history"
+                f"in {WORDS[interface]} '{name}' starts at {there:.6g}, the model at {value:.6g},"
+                f" and {len(others) - 1} more values differ; compare with the model that was"
+                " exported, with its --start-voltage and --history"
             )
 
 
