@@ -111,7 +111,7 @@ DESCRIPTIONS: Faults = {
     ),
     "nominal value of zero": (
         lambda _: ('nominal="65.7"', 'nominal="0.0"'),
-        {"nominal values", "model exchange"},  # a tolerance of zero for a state at zero
+        {"nominal values"},  # a solver takes those of the binary
         "'f_H' has the nominal value 0",
     ),
     "wrong nominal value": (

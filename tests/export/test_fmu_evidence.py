@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.export.check.agreement import Playback, played_again
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
@@ -237,10 +237,10 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
         again = repeated(archive, model, [record])
         gone = repeated(archive, model, [record.slice(0, 7000)])
     (playback,) = (run for run in again if isinstance(run, Playback))
-    assert len(playback.times) == shorter.n
+    assert len(playback.inputs.times) == shorter.n
     x0 = np.array([playback.start[n] for n in model.state_names])
     inputs = np.column_stack([playback.inputs.values[:, 0], np.zeros(shorter.n)])
-    y = psa.run(model, playback.times, inputs, x0, rtol=1e-9).y
+    y = psa.run(model, playback.inputs.times, inputs, x0, rtol=1e-9).y
     error = playback.expected - y[:, model.output_names.index("displacement")]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(playback.stated, rel=1e-4)
     refused = gone[-1]

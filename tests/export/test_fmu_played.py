@@ -19,8 +19,7 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
-from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.importer.play import Run, communication_points, stepped
+from psa_casadi.export.importer.masters import Run, Signals, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import start_for
@@ -115,7 +114,7 @@ def test_a_step_is_divided_where_the_fmu_is_fast(tmp_path: Path) -> None:
     played = psa.run(there, T[::4], U[::4], np.zeros(0)).y
     assert np.std(played - exact) < 1e-3 * np.std(exact)
     table = {"k": 40.0}
-    run = Run(str(path), "", 1, ("u",), ("y",), table, T[::4], U[::4], "linear")
+    run = Run(str(path), "", 1, ("y",), table, Signals(("u",), T[::4], U[::4]))
     with Fmu(path) as fmu:
         assert np.std(stepped(fmu, run) - exact) > 3e-3 * np.std(exact)
 
@@ -171,6 +170,17 @@ def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> Non
         exact = psa.run(model, T, U, np.zeros(1), rtol=1e-9, unknowns=["k"], outputs=["y"])
         assert result.y == pytest.approx(exact.y, abs=most)
         assert result.sensitivity == pytest.approx(exact.sensitivity, abs=most)
+
+
+def test_inputs_move_while_the_solver_takes_a_step(tmp_path: Path) -> None:
+    """One with event indicators is not taken for one whose importer holds the inputs."""
+    stack, time = psa.stack_model("P-885.51"), np.linspace(0.0, 0.1, 101)
+    voltage = 50.0 - 50.0 * np.cos(40.0 * np.pi * time)
+    there = psa.fmu_model(psa.export_fmu(stack, tmp_path / "stack.fmu"), interface="model exchange")
+    u = np.array([voltage if n == "voltage" else 0.0 * voltage for n in there.input_names]).T
+    y = psa.run(there, time, u, np.zeros(0)).y[:, there.output_names.index("displacement")]
+    exact = psa.simulate(stack, time, voltage).displacement
+    assert y == pytest.approx(exact, abs=1e-3 * np.ptp(exact))
 
 
 def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:

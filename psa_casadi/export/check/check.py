@@ -13,10 +13,9 @@ from psa_casadi.common.files import requests_to_end_answered, why_not_read
 from psa_casadi.common.strict_json import read_json
 from psa_casadi.export.check import binaries, description
 from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
-from psa_casadi.export.check.apart import OVERTIME, rows_apart
+from psa_casadi.export.check.apart import OVERTIME, Task, rows_apart
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.foreign import described
-from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
     LEFT_OUT,
     LEFT_OUT3,
@@ -129,7 +128,7 @@ def check_fmu(
             holds_others = any(archive.directory.glob("resources/*/modelDescription.xml"))
             foreign = holds_others or (model is None and not ours)
         if foreign:
-            rows += [c.row() for c in described(archive, description.invalid)]
+            rows += [c.row() for c in described(archive)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
             rows += rows_apart(task, end)
             return CheckReport(path, tuple(rows), compared=False, foreign=True)

@@ -233,9 +233,10 @@ class Instance:
             whole = every if real else [int(v) for v in np.rint(every)]
             getattr(self.fmi, f"set{g.type}")(g.references, whole)
 
-    def step(self, point: float, size: float) -> None:
-        """Do one communication step."""
-        self.fmi.doStep(point, size)
+    def step(self, point: float, size: float) -> bool:
+        """Do one communication step; return whether the FMU ends the simulation (FMI 3.0)."""
+        done = self.fmi.doStep(point, size)
+        return bool(done and done[1])
 
     def set_rates(self, rates: Mapping[str, float]) -> None:
         """Set the time derivatives of inputs for the next communication step (FMI 2.0 only)."""
