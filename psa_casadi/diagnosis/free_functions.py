@@ -24,7 +24,7 @@ from psa_casadi.diagnosis.probes import changes
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.parts import fit_longer_parts, follows
+from psa_casadi.identification.own_model import fit_longer_parts, follows
 from psa_casadi.identification.result import with_origin
 from psa_casadi.model.component import Component, Expression, Symbols
 from psa_casadi.model.compose import Model

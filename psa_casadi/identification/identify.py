@@ -10,9 +10,13 @@ from psa_casadi.common.interruption import current_work, interruptible_work
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.advice import Advice, advice
-from psa_casadi.identification.combinations import Combination, free_combinations
-from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
-from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.determinacy import (
+    Combination,
+    Determinacy,
+    assumed_ratio,
+    determinacy,
+    free_combinations,
+)
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.inputs import even_clock
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
@@ -21,6 +25,7 @@ from psa_casadi.identification.result import (
     EXCESSIVE,
     Identification,
     doubts_of,
+    evidence_of,
     noise_found,
     with_origin,
 )

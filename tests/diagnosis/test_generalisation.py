@@ -100,7 +100,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         lead = experiments[1].known
         offset = float(np.mean(errors[1][:samples][lead]))
         sigma = tuple(float(np.std(e)) for e in errors)
-        observed = replace(result, residuals=errors[0], sigma=sigma)
+        observed = replace(result, experiments=experiments, residuals=errors[0], sigma=sigma)
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)

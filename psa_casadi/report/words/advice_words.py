@@ -13,7 +13,7 @@ import numpy as np
 from psa_casadi.common.errors import quoted
 from psa_casadi.common.units import convert
 from psa_casadi.identification.advice import Advice, Plan
-from psa_casadi.identification.combinations import Combination
+from psa_casadi.identification.determinacy import Combination
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.words.phrases import listing
 
