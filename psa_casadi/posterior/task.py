@@ -36,35 +36,32 @@ class Within:
     high: FloatArray
 
     @property
+    def _cases(self) -> list[BoolArray]:
+        """Which coordinates have two bounds, a lower one (first of these cases), an upper one."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        return [below & above, below, above]
+
+    @property
     def bounded(self) -> BoolArray:
         """Which coordinates have a bound (size,)."""
         return np.isfinite(self.low) | np.isfinite(self.high)
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Return z (size,) of a theta strictly within the bounds."""
-        below, above = np.isfinite(self.low), np.isfinite(self.high)
-        from_low, to_high = theta - self.low, self.high - theta
-        with np.errstate(all="ignore"):  # of the branches that are not taken
-            return np.where(
-                below & above,
-                np.log(from_low) - np.log(to_high),
-                np.where(below, np.log(from_low), np.where(above, np.log(to_high), theta)),
-            )
+        with np.errstate(all="ignore"):  # of the cases that do not hold
+            from_low, to_high = np.log(theta - self.low), np.log(self.high - theta)
+            return np.select(self._cases, [from_low - to_high, from_low, to_high], theta)
 
     def theta(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return theta, d theta / d z and d ln |d theta / d z| / d z, each (size,)."""
-        below, above = np.isfinite(self.low), np.isfinite(self.high)
-        share = 0.5 * (1.0 + np.tanh(0.5 * z))
+        share, one, low, high = 0.5 * (1.0 + np.tanh(0.5 * z)), np.ones_like(z), self.low, self.high
         with np.errstate(over="ignore", invalid="ignore"):
-            size, grown = self.high - self.low, np.exp(z)
-            both, one = below & above, below ^ above
-            theta = np.where(both, self.low + size * share, z)
-            theta = np.where(one & below, self.low + grown, theta)
-            theta = np.where(one & above, self.high - grown, theta)
-            slope = np.where(both, size * share * (1.0 - share), 1.0)
-            slope = np.where(one, np.where(below, grown, -grown), slope)
-        bend = np.where(both, 1.0 - 2.0 * share, np.where(one, 1.0, 0.0))
-        return theta, slope, bend
+            size, grown = high - low, np.exp(z)
+            inside = [low + size * share, low + grown, high - grown]
+            slopes = [size * share * (1.0 - share), grown, -grown]
+        bends = [1.0 - 2.0 * share, one, one]
+        theta, slope = np.select(self._cases, inside, z), np.select(self._cases, slopes, 1.0)
+        return theta, slope, np.select(self._cases, bends, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

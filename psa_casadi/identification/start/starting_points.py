@@ -546,7 +546,7 @@ def placed(
 
     Poles that hardly show are left out; with `weak` also those that hardly do over the strongest.
     """
-    response = [Response(e.h, source, e.y, e.valid, e.sigma)]
+    response = Response(e.h, source, e.y, e.valid, e.sigma)
     for order in orders:
         poles = vector_fit(response, order)
         share = contributions(response, poles)
