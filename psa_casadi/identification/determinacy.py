@@ -53,10 +53,7 @@ class Determinacy:
 
 
 def determinacy(
-    fit: Fit,
-    *,
-    not_unique: Sequence[str] = (),
-    assumed: FloatArray | None = None,
+    fit: Fit, *, not_unique: Sequence[str] = (), assumed: FloatArray | None = None
 ) -> Determinacy:
     """Return what a fit determines.
 

@@ -30,11 +30,7 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, predict
-from psa_casadi.identification.fitting.unknowns import (
-    static_compliance,
-    unknowns_of,
-    within_bounds,
-)
+from psa_casadi.identification.fitting.unknowns import static_compliance, unknowns_of, within_bounds
 from psa_casadi.identification.refitting import (
     differing,
     equal,

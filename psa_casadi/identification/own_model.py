@@ -26,12 +26,7 @@ from psa_casadi.common.notes import Note, note
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.experiments import (
-    column_notes,
-    experiments_of,
-    given_to,
-    undecided,
-)
+from psa_casadi.identification.experiments import column_notes, experiments_of, given_to, undecided
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.inputs import read_like, read_otherwise
 from psa_casadi.identification.multistart import (

@@ -535,10 +535,7 @@ def conditions(
 
 
 def in_forces(
-    start: Model,
-    k: float | None,
-    coefficients: Mapping[str, float] | None,
-    bend: HysteresisPart,
+    start: Model, k: float | None, coefficients: Mapping[str, float] | None, bend: HysteresisPart
 ) -> tuple[Model, tuple[str, ...], list[Note]]:
     """Return `start` with all that is identified, k_P and k_B being those of `start`.
 

@@ -152,13 +152,7 @@ class Profile:
     high: float | None
 
 
-def profile(
-    fit: Fit,
-    name: str,
-    *,
-    points: int = 10,
-    progress: Progress = silent,
-) -> Profile:
+def profile(fit: Fit, name: str, *, points: int = 10, progress: Progress = silent) -> Profile:
     """Return the profile likelihood of a free parameter of a fit, with up to `points` on each side.
 
     The parameter is held on a grid that grows outwards until the limit is crossed; every point is

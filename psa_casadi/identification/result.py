@@ -18,13 +18,7 @@ from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
 from psa_casadi.model.compose import Model
-from psa_casadi.model.evidence import (
-    Covariance,
-    Evidence,
-    RecordRun,
-    ReferenceRun,
-    SeenRange,
-)
+from psa_casadi.model.evidence import Covariance, Evidence, RecordRun, ReferenceRun, SeenRange
 from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.records.noise import fast_noise, first_order_noise, runs_of
 from psa_casadi.records.noise_kinds import NoiseFound, noise_kinds
