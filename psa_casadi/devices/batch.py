@@ -47,7 +47,7 @@ from psa_casadi.documents.files import DeviceFile, RecordUsed, copied, damage, h
 from psa_casadi.documents.findings import DEVICE_FILE, device_finding, finding_content
 from psa_casadi.model.component import Component
 from psa_casadi.model.own_effects import own_effects
-from psa_casadi.population.finding import Finding
+from psa_casadi.population.population import Finding
 from psa_casadi.version import __version__
 
 

@@ -32,7 +32,7 @@ from psa_casadi.diagnosis.probes import changes, tangents
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale, View, hypothesis
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.parts import fit_longer_parts, follows
+from psa_casadi.identification.own_model import fit_longer_parts, follows
 from psa_casadi.identification.refitting import refit
 from psa_casadi.identification.result import with_origin
 from psa_casadi.model.component import Component, Equations, Expression, Symbols

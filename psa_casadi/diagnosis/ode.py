@@ -32,7 +32,7 @@ from psa_casadi.identification.inputs import (
     refitted,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
-from psa_casadi.identification.parts import (
+from psa_casadi.identification.own_model import (
     NEAR,
     Made,
     cut,

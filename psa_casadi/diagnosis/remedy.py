@@ -36,6 +36,7 @@ from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.component import SPECTRAL_PEAKS, Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.stacks import stack_model
+from psa_casadi.model.variables import NORMAL_95
 from psa_casadi.records.record import Record
 from psa_casadi.simulation.simulate import (
     accurate,
@@ -446,9 +447,6 @@ TESTS: dict[str, Callable[[Model, Model, Drive], list[Figure]]] = {
 SIGNED = ("hold", "top")
 
 
-_NORMAL_95 = 1.959963984540054
-
-
 @dataclass(frozen=True)
 class Size:
     """What an effect changes in a test, in `unit`; signed where it moves on (hold, top).
@@ -549,7 +547,7 @@ def _intervals(
     if known is None or not known.names or effect.trial_starts:  # its starts share the gain's size
         return [None] * len(figures)
     size, directions = np.linalg.eigh(np.array(known.matrix))
-    moves = _NORMAL_95 * directions * np.sqrt(np.maximum(size, 0.0))
+    moves = NORMAL_95 * directions * np.sqrt(np.maximum(size, 0.0))
     spread = np.zeros(len(figures))
     for move in moves.T:
         changed = {}

@@ -37,9 +37,9 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis
 from psa_casadi.diagnosis.search.state import Step, contenders
 from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
+from psa_casadi.identification.result import evidence_of
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import ErrorBudget, ErrorShare, HeldOut
 from psa_casadi.model.variables import Interval

@@ -18,7 +18,7 @@ from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
-from psa_casadi.population.finding import (
+from psa_casadi.population.population import (
     BudgetShare,
     Estimate,
     Finding,

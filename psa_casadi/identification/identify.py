@@ -10,9 +10,13 @@ from psa_casadi.common.interruption import current_work, interruptible_work
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.advice import Advice, advice
-from psa_casadi.identification.combinations import Combination, free_combinations
-from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
-from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.determinacy import (
+    Combination,
+    Determinacy,
+    assumed_ratio,
+    determinacy,
+    free_combinations,
+)
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.inputs import even_clock
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
@@ -21,19 +25,12 @@ from psa_casadi.identification.result import (
     EXCESSIVE,
     Identification,
     doubts_of,
+    evidence_of,
     noise_found,
     with_origin,
 )
 from psa_casadi.identification.search import loads_as_curves, search_forms
-from psa_casadi.identification.start.doubts import (
-    doubtful_quantity,
-    doubtful_sign,
-    doubtful_time,
-    doubtful_unit,
-    doubtful_voltage,
-    refuse_few,
-    refuse_unreadable,
-)
+from psa_casadi.identification.start.doubts import doubtful, refuse_few, refuse_unreadable
 from psa_casadi.identification.start.ordinary import (
     Hysteresis,
     capacitance_of,
@@ -52,9 +49,6 @@ from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 
 #: Rounds of fitting with every record's residual as its noise level.
 _LEVEL_ROUNDS = 2
-
-#: What may be unlike a stack's in records.
-_DOUBTS = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity)
 
 FORCE_NOTE = note("force_assumed")
 INTERRUPTED = note("interrupted")
@@ -132,12 +126,9 @@ def identify(
     noise: tuple[NoiseFound, ...] = ()
     if not best.interrupted:
         try:
+            sampled = [known[r.sha256] for r in fitted]
             evidence = evidence_of(
-                best,
-                determined,
-                best.predicted(),
-                by="psa identify",
-                sampled=[known[r.sha256] for r in fitted],
+                best, determined, best.predicted(), by="psa identify", sampled=sampled
             )
             noise = noise_found(best, parts)
             progress("what further records would tell")
@@ -146,17 +137,13 @@ def identify(
             current_work().wrap_up()
     return StackIdentification(
         model=with_provenance(
-            best.model,
-            determined,
-            given_records,
-            inputs,
-            interrupted=best.interrupted,
-            evidence=evidence,
+            best.model, determined, given_records, inputs,
+            interrupted=best.interrupted, evidence=evidence,
         ),
         fit=best,
         determinacy=determined,
         doubts=(
-            *(s for doubt in _DOUBTS if (s := doubt(fitted))),
+            *doubtful(fitted),
             *doubts_of(best, determined, result.starts, result.not_unique),
             *_excess_notes(best),
         ),
@@ -172,7 +159,7 @@ def identify(
         advice=advised or (),
         interrupted=advised is None,
         noise_kinds=noise,
-    )
+    )  # fmt: skip
 
 
 def with_provenance(

@@ -28,13 +28,9 @@ from psa_casadi.common.errors import PsaError
 from psa_casadi.common.progress import Progress
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, predict
-from psa_casadi.identification.fitting.unknowns import (
-    static_compliance,
-    unknowns_of,
-    within_bounds,
-)
+from psa_casadi.identification.fitting.unknowns import static_compliance, unknowns_of, within_bounds
 from psa_casadi.identification.refitting import (
     differing,
     equal,
@@ -83,9 +79,9 @@ def exchanges(p: Values) -> Iterator[tuple[str, dict[str, float]]]:
 FAST = ("m_P", "m_B", "m", "k_P")
 #: Without this relative standard error k_P stays where it is: it would only blur every force.
 _SHARP = 0.1
-#: Evaluations of a fit from exchanged values, first and then to the end; rounds of exchanges; how
-#: far above the best cost a first fit may be to be followed.
-_FIRST, _LAST, _ROUNDS, _HOPEFUL = 5, 30, 3, 2.0
+#: Evaluations of a fit with fast parameters, and from exchanged values, first and then to the end;
+#: rounds of exchanges; how far above the best cost a first fit may be to be followed.
+_WIDER, _FIRST, _LAST, _ROUNDS, _HOPEFUL = 40, 5, 30, 3, 2.0
 
 
 def with_fast(best: Fit, progress: Progress) -> Fit:
@@ -97,10 +93,7 @@ def with_fast(best: Fit, progress: Progress) -> Fit:
         return best
     progress(f"base fit with {', '.join(more)}")
     try:
-        wider = fit(
-            best.model, best.experiments, [*free, *more],
-            sigma=best.sigma, start_states=best.starts(),
-        )  # fmt: skip
+        wider = refit(best, [*free, *more], sigma=best.sigma, evaluations=_WIDER)
     except PsaError:
         return best
     needed = len(more) * np.log(len(best.residuals))
@@ -139,10 +132,7 @@ def exchanged(best: Fit, progress: Progress) -> tuple[Fit, tuple[str, ...]]:
             if other is None or other.interrupted or not near:
                 continue
             try:
-                other = fit(
-                    other.model, best.experiments, best.unknowns.names, sigma=best.sigma,
-                    start_states=other.starts(), evaluations=_LAST,
-                )  # fmt: skip
+                other = refit(other, sigma=best.sigma, evaluations=_LAST)
             except PsaError:
                 continue
             different |= set(differing(best, other))

@@ -10,13 +10,7 @@ import numpy as np
 from psa_casadi.common.errors import InputError, PsaError, quoted
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.refitting import (
-    refit,
-    relevelled,
-    reweighted,
-    unlike,
-    with_noise,
-)
+from psa_casadi.identification.refitting import refit, relevelled, reweighted, unlike, with_noise
 from psa_casadi.identification.result import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import Parameter

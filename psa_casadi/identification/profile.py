@@ -10,6 +10,7 @@ from psa_casadi.common.progress import Progress, silent
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.model.variables import NORMAL_95
 
 _EVALUATIONS = 40
 #: A step out is at most this many times the distance that has been covered.
@@ -124,7 +125,7 @@ class _HeldFits:
 
 
 #: The 95 % quantile of chi-square with one degree of freedom.
-PROFILE_LIMIT = 3.841458820694124
+PROFILE_LIMIT = NORMAL_95**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,13 +152,7 @@ class Profile:
     high: float | None
 
 
-def profile(
-    fit: Fit,
-    name: str,
-    *,
-    points: int = 10,
-    progress: Progress = silent,
-) -> Profile:
+def profile(fit: Fit, name: str, *, points: int = 10, progress: Progress = silent) -> Profile:
     """Return the profile likelihood of a free parameter of a fit, with up to `points` on each side.
 
     The parameter is held on a grid that grows outwards until the limit is crossed; every point is

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
+from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, How, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import first_order_noise, high_frequency_noise, uncertain
@@ -75,8 +76,7 @@ def refit(
     others: Sequence[Experiment] | None = None,
     sigma: Sequence[float] | None = None,
     least: float = np.inf,
-    evaluations: int | None = None,
-    tolerance: float = 1e-5,
+    **how: Unpack[How],
 ) -> Fit:
     """Continue a fit from its end, of the same parameters unless others are `free`.
 
@@ -87,16 +87,14 @@ def refit(
     levels = sigma or residual_noise(previous)
     parts = zip(previous.record_residuals, levels, strict=True)
     now = sum(float(np.sum((part / level) ** 2)) for part, level in parts)
+    how.setdefault("evaluations", POLISH)
+    how.setdefault("goal", now * (least / max(previous.rms, 1e-300)) ** 2)
     return fit(
         previous.model,
         previous.experiments if others is None else weighted(previous, others),
         previous.unknowns.names if free is None else free,
-        sigma=levels,
-        start_states=previous.starts(),
-        evaluations=evaluations or POLISH,
-        tolerance=tolerance,
-        goal=now * (least / max(previous.rms, 1e-300)) ** 2,
-    )
+        sigma=levels, start_states=previous.starts(), **how,
+    )  # fmt: skip
 
 
 def relevelled(best: Fit, *, every: bool = False) -> Fit:
@@ -171,15 +169,11 @@ def reweighted(best: Fit, experiments: Sequence[Experiment]) -> Fit:
 
 
 def refit_or_keep(
-    previous: Fit,
-    free: Sequence[str] | None = None,
-    *,
-    sigma: Sequence[float],
-    tolerance: float = 1e-5,
+    previous: Fit, free: Sequence[str] | None = None, *, sigma: Sequence[float], **how: Unpack[How]
 ) -> Fit:
     """Return the `refit`, or the previous fit where that leads to what cannot be simulated."""
     try:
-        return refit(previous, free, sigma=sigma, tolerance=tolerance)
+        return refit(previous, free, sigma=sigma, **how)
     except PsaError:
         return previous
 
@@ -196,15 +190,10 @@ def quick_from(
     """Fit a little from other values, weighted as before; None if these cannot be simulated."""
     try:
         return fit(
-            model,
-            previous.experiments,
-            free,
-            sigma=previous.sigma,
-            start=start,
-            start_states=start_states,
-            evaluations=evaluations,
+            model, previous.experiments, free, sigma=previous.sigma, start=start,
+            start_states=start_states, evaluations=evaluations,
             rtol=quick_rtol(previous.sigma, previous.experiments),
-        )
+        )  # fmt: skip
     except PsaError:
         return None
 

@@ -29,6 +29,7 @@ from psa_casadi.identification.refitting import (
     noise_levels,
     quick_rtol,
     record_rms,
+    refit,
     refit_or_keep,
     residual_noise,
     same_place,
@@ -111,33 +112,29 @@ def search(
     noise. A keyboard interrupt ends the search at the best fit so far, if there is one. Raises
     PsaError when no start can be simulated.
     """
-    so_far: list[Fit] = []
     off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)
     model = model.with_values({n: v for c in off for n, v in c.at_gain(0.0, {}).items()})
+    so_far: list[Fit] = []
+    records = [e.record for e in fitted(experiments)]
+    mechanics = resolved(model, linear, min(r.sample_time for r in records))
+    free = [*free_parameters(model, records), *mechanics]
+    starts = starting_points(model, linear, records)
     try:
-        return _search(model, experiments, linear, thorough, progress, so_far.append)
+        ranked = _quick_fits(model, experiments, free, starts, progress, so_far)
+        return _ended(ranked, progress, so_far, thorough=thorough, retune=bool(mechanics))
     except KeyboardInterrupt:
         if not so_far:
             raise
         return Search(replace(so_far[-1], interrupted=True, converged=False), (), ())
 
 
-def _search(
-    model: Model,
-    experiments: Sequence[Experiment],
-    linear: Sequence[LinearCandidate],
-    thorough: bool,
-    progress: Progress,
-    keep: Callable[[Fit], None],
-) -> Search:
-    """Search as `search` does; `keep` gets every fit that is better than those before it."""
-    records = [e.record for e in fitted(experiments)]
-    core = free_parameters(model, records)
-    mechanics = resolved(model, linear, min(r.sample_time for r in records))
-    starts = starting_points(model, linear, records)
-    ranked = _quick_fits(model, experiments, [*core, *mechanics], starts, progress, keep)
+def _ended(
+    ranked: Sequence[tuple[str, Fit]], progress: Progress, so_far: list[Fit],
+    *, thorough: bool, retune: bool,
+) -> Search:  # fmt: skip
+    """Follow the best quick fits to their end; `so_far` gets every fit that is the best then."""
     first = ranked[0][1]
-    keep(first)
+    so_far.append(first)
     sigma = residual_noise(first)
     polished: dict[str, Fit] = {}
     for name, quick in ranked:
@@ -152,16 +149,16 @@ def _search(
         progress(f"base fit, {name} to the end")
         ended = quick if quick.interrupted else refit_or_keep(quick, sigma=sigma)
         polished[name] = ended
-        keep(min(polished.values(), key=lambda f: f.data_cost))
+        so_far.append(min(polished.values(), key=lambda f: f.data_cost))
     top = best = min(polished.values(), key=lambda f: f.data_cost)
     if not best.interrupted:
         best = with_fast(best, progress)
-        tuned = retuned(best, progress) if mechanics else best
+        tuned = retuned(best, progress) if retune else best
         if tuned is not best:
             top = best = tuned
-        keep(best)
+        so_far.append(best)
         best = without_blur(best)
-        keep(best)
+        so_far.append(best)
     outcomes, not_unique = _outcomes(ranked, polished, top)
     if thorough and not best.interrupted:
         best, open_ones = exchanged(best, progress)
@@ -188,13 +185,9 @@ def _outcomes(
 
 
 def _quick_fits(
-    model: Model,
-    experiments: Sequence[Experiment],
-    free: Sequence[str],
-    starts: Sequence[tuple[str, dict[str, float]]],
-    progress: Progress,
-    keep: Callable[[Fit], None],
-) -> list[tuple[str, Fit]]:
+    model: Model, experiments: Sequence[Experiment], free: Sequence[str],
+    starts: Sequence[tuple[str, dict[str, float]]], progress: Progress, so_far: list[Fit],
+) -> list[tuple[str, Fit]]:  # fmt: skip
     """Fit from every start with few evaluations; return those that could be simulated."""
     sigma = noise_levels(experiments)
     quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
@@ -205,8 +198,7 @@ def _quick_fits(
         return fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
 
     fits = sorted(fits_from(starts, quick_fit), key=lambda pair: pair[1].data_cost)
-    for _, best in fits[:1]:
-        keep(best)
+    so_far.append(fits[0][1])
     widest = max(e.record.range_m for e in fitted(experiments))
     # a loop that diverges is left there, unless all do
     fits = [pair for pair in fits if pair[1].rms < widest] or fits
@@ -214,18 +206,8 @@ def _quick_fits(
         if any(f.interrupted for _, f in fits):
             break
         progress(f"base fit from {name}, continued")
-        states = quick.starts()
         with suppress(PsaError):  # where it leads to what cannot be simulated, the first one stays
-            further = fit(
-                quick.model, experiments, free, start_states=states, evaluations=rounds[1],
-                **quickly,
-            )  # fmt: skip
-            fits[k] = (name, further)
-    if not fits:
-        raise PsaError(
-            "The base model could not be simulated from any start; the voltage's unit or the"
-            " displacement's sign is the likely cause: check the record."
-        )
+            fits[k] = (name, refit(quick, evaluations=rounds[1], **quickly))
     return sorted(fits, key=lambda pair: pair[1].data_cost)
 
 

@@ -155,7 +155,7 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     few = [f.name for f in figures if f.ess < LEAST_ESS * count]
     if few:
         doubts.append(note("few_draws", names=few, limit=LEAST_ESS))
-    if not task.converged:
+    if not task.fit.converged:
         doubts.append(note("start_cut_off"))
     for b in task.density.blocks:
         if b.correlation_time > _COLOURED:
@@ -248,7 +248,7 @@ def sample(
     figures = figures_of(task, tree)
     failed = [note("prior_fails", count=before.failed, draws=_PREDICTED)] if before.failed else []
     return Posterior(
-        model=task.model.with_values(task.unknowns.values(task.theta)),
+        model=task.model.with_values(task.unknowns.values(task.fit.theta)),
         tree=tree,
         figures=figures,
         divergences=result.divergences,

@@ -14,8 +14,7 @@ from psa_casadi.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
-from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Population
+from psa_casadi.population.population import Finding, Population
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.page.devices import write_comparison, write_population

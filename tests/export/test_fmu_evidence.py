@@ -23,9 +23,9 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.result import evidence_of
 from psa_casadi.model.components.outputs import OUTPUT
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads

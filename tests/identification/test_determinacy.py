@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 
 from psa_casadi.common.units import FloatArray
-from psa_casadi.identification.combinations import Combination, free_combinations, physical_formulas
-from psa_casadi.identification.determinacy import Determinacy, covariance_of
+from psa_casadi.identification.determinacy import (
+    Combination,
+    Determinacy,
+    covariance_of,
+    free_combinations,
+    physical_formulas,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.simulate import simulate
 from tests.identification.loop_fits import FREE, LOOP, loops

@@ -15,8 +15,7 @@ from psa_casadi.documents.files import identification_file
 from psa_casadi.documents.findings import read_findings
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.model_file import dumps
-from psa_casadi.population.finding import Estimate, Finding, replayed
-from psa_casadi.population.population import population
+from psa_casadi.population.population import Estimate, Finding, population, replayed
 from psa_casadi.report.page.devices import MOST, write_comparison, write_population
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.report.words.population_words import missed_sentences, population_sentences

@@ -8,8 +8,7 @@ from scipy import optimize, stats
 
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.population.finding import Estimate, Finding
-from psa_casadi.population.population import differences, frequencies, population
+from psa_casadi.population.population import Estimate, Finding, differences, frequencies, population
 from psa_casadi.population.statistics import adjusted, batch_test, drift, mixed_regression, outliers
 from tests.tiers import slow_but
 

@@ -135,7 +135,7 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
     jsonschema.Draft202012Validator(json.loads(schema_texts()["posterior.schema.json"])).validate(
         content
     )
-    fitted = task().unknowns.values(task().theta)
+    fitted = task().unknowns.values(task().fit.theta)
     for name, f in content["parameters"].items():
         assert abs(f["mean"] - TRUTH.values[name]) < 4.0 * f["sd"], name
         # the posterior is nearly normal: its mean is the fit's, but for the chains' error

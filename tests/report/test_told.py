@@ -20,7 +20,7 @@ from psa_casadi.diagnosis.corrections import Estimate
 from psa_casadi.diagnosis.held_out import Errors, Share, StackBudget
 from psa_casadi.diagnosis.result import BlindSpot, Cause, Verdict
 from psa_casadi.identification.advice import Advice
-from psa_casadi.identification.combinations import Combination
+from psa_casadi.identification.determinacy import Combination
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.report.words.text import identification_text
 from tests.report.html_page import figures, numbers, written

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -76,24 +77,32 @@ _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 _DIVERGED = 1e6
 
 
-def accurate_minimum(
+class How(TypedDict, total=False):
+    """How far a minimum is sought (`minimise`), and the tolerance `rtol` of a step."""
+
+    tolerance: float
+    evaluations: int
+    rtol: float
+    goal: float
+    radius: float
+    patient: bool
+
+
+def _accurate_minimum(
     model: Model,
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
     theta: FloatArray,
     sigma: Sequence[float],
     *,
-    tolerance: float,
-    evaluations: int,
+    tolerance: float = 1e-5,
+    evaluations: int = 40,
     rtol: float = FIT_RTOL,
     goal: float = np.inf,
     radius: float = FIRST_RADIUS,
     patient: bool = False,
 ) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's.
-
-    See `minimise` for how far it is sought.
-    """
+    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's."""
     pairs = [(_readings(e, 0), s) for e, s in zip(experiments, sigma, strict=True)]
     allowed = [
         [
@@ -482,12 +491,7 @@ def fit(
     sigma: Sequence[float],
     start: Mapping[str, float] | None = None,
     start_states: Sequence[Mapping[str, float]] | None = None,
-    evaluations: int = 40,
-    tolerance: float = 1e-5,
-    rtol: float = FIT_RTOL,
-    goal: float = np.inf,
-    radius: float = FIRST_RADIUS,
-    patient: bool = False,
+    **how: Unpack[How],
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
@@ -511,10 +515,15 @@ def fit(
             readings = _readings(e, 0) if e.channels[0].offset else np.zeros(0)
             offset = float(np.mean(readings)) if readings.size else 0.0
             unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
-    minimum, way, runs = accurate_minimum(
-        model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
-        rtol=rtol, goal=goal, radius=radius, patient=patient,
-    )  # fmt: skip
+    return fit_from(model, experiments, unknowns, theta, sigma, **how)
+
+
+def fit_from(
+    model: Model, experiments: Sequence[Experiment], unknowns: Unknowns, theta: FloatArray,
+    sigma: Sequence[float], **how: Unpack[How],
+) -> Fit:  # fmt: skip
+    """Return the fit in the coordinates of `unknowns`, from theta (size,); see `fit`."""
+    minimum, way, runs = _accurate_minimum(model, experiments, unknowns, theta, sigma, **how)
     weights = weights_of(experiments, sigma)
     further: tuple[Further, ...] = ()
     if experiments[0].further:

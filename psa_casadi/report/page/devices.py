@@ -12,8 +12,7 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_write
 from psa_casadi.documents.findings import Result, read_findings
 from psa_casadi.model.component import Component
-from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Difference, Population, differences
+from psa_casadi.population.population import Difference, Finding, Population, differences
 from psa_casadi.report.page.document import render
 from psa_casadi.report.words import population_words as words
 from psa_casadi.report.words.phrases import one_unit

@@ -11,7 +11,7 @@ import numpy as np
 from psa_casadi.common.notes import Note
 from psa_casadi.common.units import convert
 from psa_casadi.identification.advice import Advice, Plan
-from psa_casadi.identification.combinations import Combination
+from psa_casadi.identification.determinacy import Combination
 from psa_casadi.identification.grades import STRONG_CORRELATION, Degree, Grade, named
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.report.words.catalogue import TABLES, say

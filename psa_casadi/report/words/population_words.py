@@ -5,8 +5,9 @@ from collections.abc import Sequence
 
 from psa_casadi.common.units import convert
 from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.model.variables import NORMAL_95
 from psa_casadi.population import population
-from psa_casadi.population.finding import NORMAL_95, Finding
+from psa_casadi.population.population import Finding
 from psa_casadi.population.statistics import FEWEST
 from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import (

@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.result import Candidate, Diagnosis, StackDiagnosis
-from psa_casadi.identification.determinacy import NORMAL_95
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.variables import NORMAL_95
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
