@@ -333,7 +333,7 @@ def mechanism(
     Example:
         psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json
     """
-    from psa_casadi.design.mechanism.mechanism import Limits, check_goals
+    from psa_casadi.design.mechanism.mechanism import Limits, Wish
     from psa_casadi.report.page.designs import write_mechanism_page
     from psa_casadi.report.words.design_words import (
         mechanism_sentences,
@@ -347,7 +347,7 @@ def mechanism(
     loss = inputs.attempt(lambda: _share(max_stroke_loss))
     limits = Limits(loss or 0.0, max_force, (min_mass, max_mass), (0.0, max_damping))
     if wanted is not None:
-        inputs.attempt(lambda: check_goals(damping, bandwidth, wanted, limits, starts))
+        inputs.attempt(lambda: Wish(damping, bandwidth, wanted, limits, starts))
     chosen, goals = inputs.ready(chosen), inputs.ready(wanted)
     with working("designing") as progress:
         progress(f"{starts} starts")
