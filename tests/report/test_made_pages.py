@@ -48,7 +48,7 @@ def test_the_gallery_lists_every_effect() -> None:
     assert items == [f"[<code>{name}</code>](#{name})" for name in psa.EFFECTS]
 
 
-def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:
+def test_an_effect_has_equation_picture_source_and_parameters() -> None:
     effect = psa.EFFECTS["backlash"]
     text = section(effect)
     assert effect.equation_text.split(",  ", maxsplit=1)[0] in text

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+import psa_casadi as psa
 from psa_casadi.identification.advice import Advice
-from psa_casadi.report.page.results import write_fit_report, write_report
-from tests.report.browser import DARK, PHONE, Browser, on_a_phone, seen_on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, measured_on_a_phone, on_a_phone
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but
 
@@ -35,9 +35,9 @@ def report_page(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
         result = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
-        write_fit_report(result, path, origin="synthetic")
+        psa.write_fit_report(result, path, origin="synthetic")
     else:
-        write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
+        psa.write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
     return path
 
 
@@ -64,7 +64,7 @@ def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: P
 
 
 @slow
-def test_a_still_picture_is_seen_where_scripts_are_off(
+def test_a_still_picture_is_visible_where_scripts_are_off(
     browser: Browser, of_diagnosis: Path
 ) -> None:
     off = of_diagnosis.with_name("off.html")
@@ -82,8 +82,8 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
     script = "<script>console.error('by hand'); absent.name = 1;</script>"
     broken.write_text(f"<html><body>{wide}{tiny}{script}</body></html>", encoding="utf-8")
     with pytest.raises(pytest.fail.Exception, match=r"by hand.*Uncaught ReferenceError"):
-        seen_on_a_phone(browser, broken)
-    table = seen_on_a_phone(browser, broken, silent=False)
+        measured_on_a_phone(browser, broken)
+    table = measured_on_a_phone(browser, broken, silent=False)
     assert table["needed"] > PHONE
     assert table["outside"] == ["DIV.drawing"]
     assert table["small"] == ["tiny"]
@@ -91,7 +91,7 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
 
 @slow
 def test_a_phone_shows_it_legibly_without_scrolling_sideways(browser: Browser, page: Path) -> None:
-    table = seen_on_a_phone(browser, page)
+    table = measured_on_a_phone(browser, page)
     assert table["width"] == table["needed"] == PHONE
     assert table["outside"] == table["small"] == []
     assert table["drawn"] == table["plots"] >= 14

@@ -5,7 +5,9 @@ import http.client
 import io
 import json
 import re
+import signal
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,18 +15,22 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.cli import web
 from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.cli.workbench.previews import Subject
 from psa_casadi.cli.workbench.run import Run
 from psa_casadi.cli.workbench.server import Server, served
-from psa_casadi.common.errors import InputError
-from tests.contract.test_commands import request
+from tests.contract.helpers import PSA, request
+from tests.export.supplied import INFLOW, TIMES, lagged, level, supplied
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
+from tests.tiers import posix, slow
 
 SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for k in range(100))
 
@@ -83,16 +89,11 @@ class Tab:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def tab(tmp_path: Path) -> Iterator[Tab]:
     limits = Limits(one=5000, together=8000, files=3)
     desk = Desk(tmp_path, ["slow_creep"], limits=limits, module="tests.workbench.small_job")
-    with served(0, desk) as result:
-        yield result
-
-
-@pytest.fixture
-def tab(server: Server) -> Tab:
-    return Tab(server).enter()
+    with served(0, desk) as server:
+        yield Tab(server).enter()
 
 
 @pytest.mark.parametrize(
@@ -177,7 +178,7 @@ def test_a_second_tab_sees_the_same_run_and_starts_no_other(tab: Tab) -> None:
     assert tab.ask("GET", "/files/extended.fmu")[2] == b"PK"
 
 
-def test_a_stopped_run_keeps_what_it_has_and_can_begin_again(tab: Tab) -> None:
+def test_a_stopped_run_keeps_what_it_has_and_can_restart(tab: Tab) -> None:
     tab.give("a.csv", SMALL)
     tab.post("/start")
     tab.searched()
@@ -197,8 +198,7 @@ def test_a_run_ends_with_the_server(tmp_path: Path) -> None:
         tab.post("/start")
         tab.until("running")
         tab.searched()
-        job = desk.running()[0]
-        pid = job.pid
+        pid = desk.running()[0].pid
         assert pid is not None
         assert runs(pid)
     assert not runs(pid)
@@ -258,7 +258,7 @@ def test_what_arrives_takes_room(tmp_path: Path) -> None:
     class Slow(io.BytesIO):
         def read(self, size: int | None = -1, /) -> bytes:
             if self.tell():
-                with pytest.raises(InputError, match="with the other files"):
+                with pytest.raises(psa.InputError, match="with the other files"):
                     desk.add("second.csv", io.BytesIO(b"x" * 4000), 4000)
             return super().read(4500)
 
@@ -300,7 +300,7 @@ def test_a_fault_of_the_page_is_an_answer(tab: Tab, monkeypatch: pytest.MonkeyPa
     assert tab.post("/start") == 400
 
 
-def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uploaded_files_run_in_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "desk"
     folder.mkdir()
     install(tmp_path / "site", "try:\n    import ruled\nexcept ImportError: pass\n" + RIPPLE)
@@ -325,14 +325,88 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
 
     def no_server(port: int, desk: Desk) -> None:
         there.append([*sys.path])
-        raise InputError("no server")
+        raise psa.InputError("no server")
 
     monkeypatch.setattr("psa_casadi.cli.workbench.server.served", no_server)
     (tmp_path / "gratings.py").write_text(RIPPLE)
     for first in ("", str(tmp_path)):
         for modules in ([], ["gratings"]):
             monkeypatch.setattr(sys, "path", [first, *sys.path])
-            with pytest.raises(InputError, match="no server"):
+            with pytest.raises(psa.InputError, match="no server"):
                 web._serve(0, True, Subject(), Inputs(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])
+
+
+# The page on an FMU, whose records have other columns than a stack
+
+FREE = ["area=0.1:4", "outlet=0.001:0.01"]
+
+
+def _desk(folder: Path, module: str) -> Desk:
+    fitting = Fitting(fmu=supplied("tank"), free=FREE, value=["valve=1"])
+    model = own_model(Inputs(), None, fitting)
+    (folder / "desk").mkdir()
+    return Desk(folder / "desk", [], subject=web._subject(model, None, fitting), module=module)
+
+
+def _measured(folder: Path) -> bytes:
+    """Return a record of the supplier's tank whose sensor has a lag of 2 s."""
+    noise = 1e-3 * np.random.default_rng(5).standard_normal(len(TIMES))
+    y = lagged(level(0.8, 0.004), 2.0) + noise
+    columns = {"time [s]": TIMES, "inflow [1]": INFLOW, "h [%]": 100.0 * y}
+    psa.write_record(folder / "run.csv", columns)
+    return (folder / "run.csv").read_bytes()
+
+
+def test_the_columns_are_those_of_the_fmu(tmp_path: Path) -> None:
+    desk = _desk(tmp_path, "tests.workbench.small_job")
+    with served(0, desk) as server:
+        tab = Tab(server).enter()
+        page = tab.ask("GET", "/")[2].decode()
+        assert "level" in page
+        assert "charge" not in page.partition('id="page-data">')[2]
+        assert tab.give("model.json", b"{}") == 400
+        assert tab.give("run.csv", _measured(tmp_path)) == 200
+        observed = tab.state()["items"][0]["seen"]
+        assert observed["head"]["guess"] == {"time": [0, "s"], "inflow": [1, "1"]}
+        assert tab.post("/settings", {"columns": "level=h:%"}) == 200
+        observed = tab.state()["items"][0]["seen"]
+        assert observed["problems"] == []
+        assert observed["record"]["reached"]["level"][2] == "%"
+        assert base64.b64decode(observed["record"]["picture"]).startswith(b"\x89PNG")
+        assert tab.post("/start") == 200
+        (desk.folder / "let_go").touch()
+        tab.until("done")
+    words = (desk.folder / "words.txt").read_text().splitlines()
+    named = {f"--fmu={supplied('tank').name}", "--value=valve=1", *(f"--free={f}" for f in FREE)}
+    assert named < {*words}
+
+
+@slow
+def test_a_lag_is_named_and_the_extended_fmu_written(tmp_path: Path) -> None:
+    desk = _desk(tmp_path, "psa_casadi.cli.child")
+    with served(0, desk) as server:
+        tab = Tab(server).enter()
+        tab.give("run.csv", _measured(tmp_path))
+        tab.post("/settings", {"columns": "level=h:%"})
+        assert tab.post("/start") == 200
+        state = tab.until("done", 240.0)
+        assert state["result"]["verdict"] == "cause_named"
+        assert [c["effect"] for c in state["result"]["causes"]] == ["lag_of_level"]
+        assert state["run"]["events"][-1]["state"] == "best"
+        assert tab.post("/export") == 200
+        state = tab.wait(lambda s: s["export"]["status"] != "running", 240.0)
+        assert state["export"]["status"] == "done", state["export"]
+    assert desk.result("extended.fmu") is not None
+
+
+@posix
+def test_the_page_ends_whenever_it_is_interrupted(tmp_path: Path) -> None:
+    command = [*PSA, "web", "--diagnose", "--no-browser"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("Open http://127.0.0.1:")
+    process.send_signal(signal.SIGINT)  # while the next line may not be there yet
+    assert "Ended" in process.communicate(timeout=20)[1]
+    assert process.returncode == 0
