@@ -28,9 +28,9 @@ from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.sizes import Sizes, sizes_of
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor, oscillator, pair, tanks
-from tests.contract.helpers import valid
 from tests.report.browser import DARK, find_browser
 from tests.report.html_page import Page, figures, numbers
+from tests.report.test_schemas import valid
 
 
 @cache

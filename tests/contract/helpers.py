@@ -2,7 +2,6 @@
 
 import http.client
 import io
-import json
 import os
 import re
 import signal
@@ -18,7 +17,6 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import jsonschema
 import numpy as np
 
 import psa_casadi as psa
@@ -107,14 +105,6 @@ def table(path: Path) -> dict[str, Floats]:
         name: np.array([float(x) if x else np.nan for x in column])
         for name, column in zip(head.split(","), columns, strict=True)
     }
-
-
-def valid(schema: str, text: str) -> dict[str, Any]:
-    """Return what a JSON text holds, which must match a schema that is shipped."""
-    content: dict[str, Any] = json.loads(text)
-    rules = json.loads((DATA / "schemas" / f"{schema}.schema.json").read_text("utf-8"))
-    jsonschema.Draft202012Validator(rules).validate(content)
-    return content
 
 
 def rms(values: Floats) -> float:

@@ -17,6 +17,7 @@ from tests.contract import helpers
 from tests.contract.conftest import Demo
 from tests.contract.helpers import DATA, Floats, command, done, refused, rms, table, write
 from tests.report.html_page import figures, read_page
+from tests.report.test_schemas import valid
 from tests.studies.plants.make import make_demo
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("contract")]
@@ -27,7 +28,7 @@ VERDICTS = (
 
 def read(path: Path, schema: str) -> dict[str, Any]:
     """Return a JSON file that fits its schema, which is shipped with the package."""
-    content = helpers.valid(schema, path.read_text("utf-8"))
+    content = valid(schema, path.read_text("utf-8"))
     assert content["format"] == f"psa_casadi.{schema}/1"
     return content
 

@@ -10,17 +10,9 @@ import pytest
 import psa_casadi as psa
 from tests.any_model import own_plants
 from tests.any_model.own_models import motor
-from tests.contract.helpers import (
-    done,
-    off,
-    on_reference,
-    reference_run,
-    rms,
-    table,
-    valid,
-    write,
-)  # fmt: skip
+from tests.contract.helpers import done, off, on_reference, reference_run, rms, table, write
 from tests.report.html_page import read_page
+from tests.report.test_schemas import valid
 
 pytestmark = pytest.mark.slow
 STACK = "P-885.51"

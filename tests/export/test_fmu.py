@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.export.check.agreement import has_reference
@@ -158,7 +159,7 @@ def _errors(fmi: int, end: float, *options: dict[str, Any]) -> list[float]:
             output=["displacement"], **option,
         )  # fmt: skip
         grid, first = np.unique(result["time"], return_index=True)  # it repeats times at events
-        truth = simulate(
+        truth: FloatArray = simulate(
             model_named(STACK).values, lambda t: (0.0, 100.0, 20.0)[(t >= 5e-3) + (t >= 15e-3)],
             grid, breakpoints=(5e-3, 15e-3),
         ).displacement  # fmt: skip

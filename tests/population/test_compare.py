@@ -21,7 +21,7 @@ from psa_casadi.report.page.devices import MOST, write_comparison, write_populat
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.report.words.population_words import missed_sentences, population_sentences
 from tests.model.evidence_models import evident_model
-from tests.report.browser import DARK, PHONE, Browser, find_browser, measured_on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, find_browser, seen_on_a_phone
 from tests.report.html_page import Page, figures
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow
@@ -204,6 +204,6 @@ def test_the_pages_in_a_browser(
         assert '<svg class="main-svg"' in box
     for flags in ((), (DARK,)):
         assert browser.serious_faults(page, *flags) == []
-    table = measured_on_a_phone(browser, page)
+    table = seen_on_a_phone(browser, page)
     assert table["width"] == table["needed"] == PHONE
     assert table["outside"] == []

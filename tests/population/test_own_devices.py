@@ -12,8 +12,9 @@ from psa_casadi.documents.files import identification_file
 from psa_casadi.documents.findings import finding_content
 from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
-from tests.contract.helpers import done, valid
+from tests.contract.helpers import done
 from tests.report.html_page import Page
+from tests.report.test_schemas import valid
 
 
 def device(name: str, seed: int, inertia: float = 3e-5, friction: float = 0.0) -> psa.Signals:

@@ -122,7 +122,7 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     return outer
 
 
-def measured_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
+def seen_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
     """Return how a page came out on a phone."""
     hear = "addEventListener('message', function (e) { tell(JSON.parse(e.data)); });"
     table: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)

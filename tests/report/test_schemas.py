@@ -20,9 +20,17 @@ from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.ports import with_ports
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
-from tests.contract.helpers import DATA, valid
+from tests.contract.helpers import DATA
 from tests.model.evidence_models import evident_model
 from tests.report.report_cases import diagnosis, identification, with_periodic
+
+
+def valid(schema: str, text: str) -> dict[str, Any]:
+    """Return what a JSON text holds, which must match a schema that is shipped."""
+    content: dict[str, Any] = json.loads(text)
+    rules = json.loads((DATA / "schemas" / f"{schema}.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator(rules).validate(content)
+    return content
 
 
 def test_what_is_shipped_is_what_the_records_declare() -> None:

@@ -5,9 +5,7 @@ import http.client
 import io
 import json
 import re
-import signal
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,22 +13,18 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import pytest
 
 import psa_casadi as psa
 from psa_casadi.cli import web
 from psa_casadi.cli.inputs import Inputs
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.cli.workbench.previews import Subject
 from psa_casadi.cli.workbench.run import Run
 from psa_casadi.cli.workbench.server import Server, served
-from tests.contract.helpers import PSA, request
-from tests.export.supplied import INFLOW, TIMES, lagged, level, supplied
+from tests.contract.helpers import request
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
-from tests.tiers import posix, slow
 
 SMALL = b"t (ms),U [V],pos\n" + b"".join(b"%d,%d,%d\n" % (k, k % 50, k % 50) for k in range(100))
 
@@ -336,77 +330,3 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
                 web._serve(0, True, Subject(), Inputs(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])
-
-
-# The page on an FMU, whose records have other columns than a stack
-
-FREE = ["area=0.1:4", "outlet=0.001:0.01"]
-
-
-def _desk(folder: Path, module: str) -> Desk:
-    fitting = Fitting(fmu=supplied("tank"), free=FREE, value=["valve=1"])
-    model = own_model(Inputs(), None, fitting)
-    (folder / "desk").mkdir()
-    return Desk(folder / "desk", [], subject=web._subject(model, None, fitting), module=module)
-
-
-def _measured(folder: Path) -> bytes:
-    """Return a record of the supplier's tank whose sensor has a lag of 2 s."""
-    noise = 1e-3 * np.random.default_rng(5).standard_normal(len(TIMES))
-    y = lagged(level(0.8, 0.004), 2.0) + noise
-    columns = {"time [s]": TIMES, "inflow [1]": INFLOW, "h [%]": 100.0 * y}
-    psa.write_record(folder / "run.csv", columns)
-    return (folder / "run.csv").read_bytes()
-
-
-def test_the_columns_are_those_of_the_fmu(tmp_path: Path) -> None:
-    desk = _desk(tmp_path, "tests.workbench.small_job")
-    with served(0, desk) as server:
-        tab = Tab(server).enter()
-        page = tab.ask("GET", "/")[2].decode()
-        assert "level" in page
-        assert "charge" not in page.partition('id="page-data">')[2]
-        assert tab.give("model.json", b"{}") == 400
-        assert tab.give("run.csv", _measured(tmp_path)) == 200
-        observed = tab.state()["items"][0]["seen"]
-        assert observed["head"]["guess"] == {"time": [0, "s"], "inflow": [1, "1"]}
-        assert tab.post("/settings", {"columns": "level=h:%"}) == 200
-        observed = tab.state()["items"][0]["seen"]
-        assert observed["problems"] == []
-        assert observed["record"]["reached"]["level"][2] == "%"
-        assert base64.b64decode(observed["record"]["picture"]).startswith(b"\x89PNG")
-        assert tab.post("/start") == 200
-        (desk.folder / "let_go").touch()
-        tab.until("done")
-    words = (desk.folder / "words.txt").read_text().splitlines()
-    named = {f"--fmu={supplied('tank').name}", "--value=valve=1", *(f"--free={f}" for f in FREE)}
-    assert named < {*words}
-
-
-@slow
-def test_a_lag_is_named_and_the_extended_fmu_written(tmp_path: Path) -> None:
-    desk = _desk(tmp_path, "psa_casadi.cli.child")
-    with served(0, desk) as server:
-        tab = Tab(server).enter()
-        tab.give("run.csv", _measured(tmp_path))
-        tab.post("/settings", {"columns": "level=h:%"})
-        assert tab.post("/start") == 200
-        state = tab.until("done", 240.0)
-        assert state["result"]["verdict"] == "cause_named"
-        assert [c["effect"] for c in state["result"]["causes"]] == ["lag_of_level"]
-        assert state["run"]["events"][-1]["state"] == "best"
-        assert tab.post("/export") == 200
-        state = tab.wait(lambda s: s["export"]["status"] != "running", 240.0)
-        assert state["export"]["status"] == "done", state["export"]
-    assert desk.result("extended.fmu") is not None
-
-
-@posix
-def test_the_page_ends_whenever_it_is_interrupted(tmp_path: Path) -> None:
-    command = [*PSA, "web", "--diagnose", "--no-browser"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("Open http://127.0.0.1:")
-    process.send_signal(signal.SIGINT)  # while the next line may not be there yet
-    assert "Ended" in process.communicate(timeout=20)[1]
-    assert process.returncode == 0
