@@ -12,16 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import make_interp_spline
 
 import psa_casadi as psa
-from tests.contract.helpers import (
-    Floats,
-    command,
-    done,
-    off,
-    reference_run,
-    refused,
-    table,
-    write,
-)  # fmt: skip
+from tests.contract.helpers import Floats, command, done, off, reference_run, refused, table, write
 
 STACK = "P-885.51"
 #: The share of the range to which a simulation agrees with the independent reference.

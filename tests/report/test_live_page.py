@@ -21,7 +21,6 @@ from psa_casadi.report.page.designs import write_design_page
 from psa_casadi.report.page.live import LiveModel, live_data, live_design, thinned
 from tests.any_model import own_models
 from tests.any_model import own_plants as plants
-from tests.contract.helpers import rms
 from tests.report.browser import DARK, Browser, driven, script
 from tests.report.html_page import Page
 from tests.report.report_cases import diagnosis
@@ -59,7 +58,7 @@ def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
     observed, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
     use = observed & ~e.held_out
     residual += np.mean(center[use]) - np.mean(residual[use])
-    return 1e9 * rms(residual[observed & e.held_out])
+    return 1e9 * float(np.sqrt(np.mean(residual[observed & e.held_out] ** 2)))
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +186,7 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
     statement = texts_around(browser, tmp_path / "d.html", "k_L", 8)
     assert statement[0].startswith("Off the path by 50 nm rms")
     changed = respond(model.with_values({"k_L": 8.0}), t, played.voltage).displacement
-    off = 1e9 * rms(path - changed)
+    off = 1e9 * float(np.sqrt(np.mean((path - changed) ** 2)))
     assert rms_in(statement[1], "by ") == pytest.approx(off, rel=6e-3)
 
 
@@ -257,7 +256,7 @@ def test_a_users_model_runs_in_its_page(
         name = caption.split()[0]
         output = re.search(r"^Error: ([\d.e+-]+) (m?)", text)
         assert output is not None, text
-        misfit = rms(record.columns[name] - y[name])
+        misfit = float(np.sqrt(np.mean((record.columns[name] - y[name]) ** 2)))
         assert float(output[1]) * (1e-3 if output[2] else 1.0) == pytest.approx(misfit, rel=6e-3)
     psa.write_fit_report(result, tmp_path / "still.html", still=True)
     assert "Change the model and see" not in (tmp_path / "still.html").read_text("utf-8")
