@@ -161,8 +161,10 @@ def fmu(
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     targets = inputs.ready(targets)
     if chosen.structure.foreign:
-        if fmi == "3":
-            raise InputError("an FMU that holds another FMU is of FMI 2.0; leave --fmi out.")
+        _refuse_around_fmu({
+            "--fmi 3": fmi == "3", "--platforms": platforms != "host", "--step": seconds,
+            "--name": name, "--sets-to": sets_to, "--validity-output": validity_output,
+        })  # fmt: skip
         psa.export_extended(chosen, output)
         show_written(output)
         return
@@ -193,6 +195,15 @@ def fmu(
             f" `{INSTALL_ZIG}` it loads on older ones too."
         )
     show_written(output)
+
+
+def _refuse_around_fmu(options: Mapping[str, object]) -> None:
+    """Raise InputError for options with a value that an FMU around another one does not take."""
+    if refused := [option for option, value in options.items() if value]:
+        raise InputError(
+            "an FMU that holds another FMU is of FMI 2.0, for this machine, with the other's"
+            f" steps and names; leave {' and '.join(refused)} out."
+        )
 
 
 def _evidence_words(model: "psa.Model", sets: int) -> str:

@@ -180,7 +180,7 @@ class Inputs:
     ) -> "psa.Model | None":
         """Read a model, or compose a named stack or part; one at most, and one where it is needed.
 
-        With `any_model` the file need not hold a stack.
+        With `any_model` the file need not hold a stack, and FILE.py:FUNCTION makes the model.
         """
         options = {"--model": path, "--stack": stack, "--part": part}
         named = [name for name, value in options.items() if value is not None]
@@ -199,7 +199,10 @@ class Inputs:
                 )
             return None
         if any_model:
-            return self.attempt(lambda: psa.load_model(path, self.user_effects))
+            from psa_casadi.cli.own_model import from_python
+
+            read = partial(psa.load_model, path, self.user_effects)
+            return self.attempt(lambda: from_python(path) or read())
         return self.model(path)
 
     def turns(self, history: str | None) -> tuple[float, ...]:
@@ -289,8 +292,8 @@ def similar(word: str, known: Iterable[str], otherwise: str) -> str:
     return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
-def step_seconds(text: str) -> float:
-    """Return the time [s] of a step, a number with its unit; none is guessed.
+def step_seconds(text: str, *, plain: bool = False) -> float:
+    """Return the time [s] of a step, a number with its unit; a `plain` number is in seconds.
 
     Raises InputError for anything else.
     """
@@ -302,6 +305,8 @@ def step_seconds(text: str) -> float:
     except ValueError:
         match = None
     if match and not match["unit"].strip():
+        if plain:
+            return number
         meant = " or ".join(f"{match['number']}{unit}" for unit in ("s", "ms", "us"))
         raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
     unit = parse_unit(match["unit"], "time").name if match else ""

@@ -79,9 +79,8 @@ def own_model(
 def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
     from psa_casadi.simulation.start import is_stack
 
-    match = _PYTHON.fullmatch(str(path))
-    if match is not None:
-        return _made(Path(match["file"]), match["name"] or "")
+    if (model := from_python(path)) is not None:
+        return model
     if path.suffix.lower() == ".fmu" or fitting.fmu:
         return _imported(inputs, path, fitting, fitted)
     try:
@@ -106,8 +105,12 @@ def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa
     return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
 
 
-def _made(file: Path, name: str) -> psa.Model:
-    """Return the model that a function of a Python file returns, or that a variable of it is."""
+def from_python(path: Path) -> psa.Model | None:
+    """Return the model of FILE.py:FUNCTION, of a function or a variable; None for other paths."""
+    match = _PYTHON.fullmatch(str(path))
+    if match is None:
+        return None
+    file, name = Path(match["file"]), match["name"] or ""
     if not file.is_file():
         raise InputError(f"--model: there is no file {file}; check the name and the directory.")
     sys.path.append(str(file.resolve().parent))  # modules in its folder can be imported

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.common.errors import PsaError
+from psa_casadi.common.errors import InputError, PsaError, quoted
 from psa_casadi.common.interruption import interruptible_work
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.progress import Progress, silent
@@ -261,6 +261,7 @@ def diagnose(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     effects: Sequence[Component] | None = None,
+    leave_out: Sequence[str] = (),
     method: Method | None = None,
     progress: Progress = silent,
     watch: Callable[[Tried], None] = lambda _: None,
@@ -277,12 +278,16 @@ def diagnose(
     `reference.Healthy`).
 
     `model` is where the base fit starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is
-    the form of the base's (see `identify`); `effects` is the table to search; `method` can leave
-    parts of the method out (for its ablation). `progress` gets what is done in words, `watch` every
-    hypothesis of the search (`Tried`). Raises InputError, and DiagnosisInterrupted with the best
-    model so far at a keyboard interrupt once there is one.
+    the form of the base's (see `identify`); `effects` is the table to search, without those of the
+    names `leave_out`; `method` can leave parts of the method out (for its ablation). `progress`
+    gets what is done in words, `watch` every hypothesis of the search (`Tried`). Raises InputError,
+    and DiagnosisInterrupted with the best model so far at a keyboard interrupt once there is one.
     """
     method = method or Method()
+    table = tuple(effects if effects is not None else known_effects().values())
+    if unknown := set(leave_out) - {c.name for c in table}:
+        raise InputError(f"`leave_out` has {quoted(sorted(unknown))}, which is no effect.")
+    table = tuple(c for c in table if c.name not in leave_out)
     inputs, kept = records_given(records), records_given(holdout)
     sound, since = records_given(reference), None
     if sound:
@@ -297,7 +302,6 @@ def diagnose(
     with stage("preparing"):
         (whole, cut), (held, cut_too) = without_gaps(inputs), without_gaps(kept)
         ordered = in_one_order(whole)
-        table = tuple(effects if effects is not None else known_effects().values())
         free = () if since else None
         task = Task((), table, STACK, method, progress, so_far.append, watch, free=free)
         start, task, scale_given, notes = _prepared(

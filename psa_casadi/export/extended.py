@@ -105,7 +105,7 @@ def _by_place(part: FmuPart) -> dict[str, list[Component]]:
         if len(added) != 1 or None in added:
             raise InputError(
                 f"The effect '{effect.name}' acts inside the FMU; only effects at its inputs and"
-                " outputs can stand around it."
+                " outputs can stand around it. `psa simulate --model` runs it, and Python."
             )
         table[str(added.pop())].append(effect)
     return table

@@ -56,7 +56,7 @@ class State:
     name: str
     unit: str
     description: str
-    nominal: Nominal
+    nominal: Nominal = 1.0
     start: float = 0.0
     display_unit: str | None = None
     memory: bool = False

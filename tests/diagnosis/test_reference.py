@@ -110,5 +110,5 @@ def test_a_voltage_that_the_reference_does_not_show_is_refused(sound: psa.Record
 
 def test_a_model_of_ones_own_takes_no_reference(sound: psa.Record) -> None:
     words: Any = {"reference": sound}
-    with pytest.raises(psa.InputError, match="'reference' is not among the words for a model"):
+    with pytest.raises(psa.InputError, match="'reference' is not among the arguments for"):
         psa.diagnose(oven(), [sound], **words)

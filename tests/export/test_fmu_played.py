@@ -273,7 +273,7 @@ def test_effects_around_an_fmu_are_exported_around_it(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_an_fmu_that_holds_another_one_keeps_to_the_standard(tmp_path: Path) -> None:
     path = psa.export_extended(with_effects(), tmp_path / "tank.fmu")
-    assert {r.name for r in psa.check_fmu(path, foreign=True).failures} <= {"memory"}  # PythonFMU's
+    assert {r.name for r in psa.check_fmu(path).failures} <= {"memory"}  # PythonFMU's
 
 
 def test_a_process_that_was_ended_by_others_is_replaced() -> None:

@@ -88,9 +88,9 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
 
 
 def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
-    with pytest.raises(psa.InputError, match="'hysteresis' is not among the words"):
+    with pytest.raises(psa.InputError, match="'hysteresis' is not among the arguments"):
         psa.sample(motor(), records(1), hysteresis="friction")
-    with pytest.raises(psa.InputError, match="'starts' is not among the words for"):
+    with pytest.raises(psa.InputError, match="'starts' is not among the arguments for"):
         psa.sample(psa.stack_model("demo"), "record.csv", starts=3)
     with pytest.raises(psa.InputError, match="'tau' was given, which is not sampled"):
         psa.sample(motor(), records(1), prior={"tau": 1.0})

@@ -98,7 +98,7 @@ def check_fmu(
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
     Without lief (`pip install lief`) the binaries are not inspected.
 
-    A `foreign` one, by default every one of another tool without a `model`, is
+    A `foreign` one, by default every one of another tool without a `model`, or around one, is
     checked by the standard alone: a row fails where a clause is violated, and notes what else a
     buyer should know. See docs/howto/fmu_export.md.
 
@@ -125,8 +125,9 @@ def check_fmu(
     end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
         if foreign is None:
-            tool = str(archive.description.generationTool)
-            foreign = model is None and not tool.startswith("psa_casadi")
+            ours = str(archive.description.generationTool).startswith("psa_casadi")
+            holds_others = any(archive.directory.glob("resources/*/modelDescription.xml"))
+            foreign = holds_others or (model is None and not ours)
         if foreign:
             rows += [c.row() for c in described(archive, description.invalid)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)

@@ -262,8 +262,12 @@ def _check(name: str, step: float, precision: str, hold: str, substeps: int | No
             f"'{name}' cannot name functions in C; use letters, digits, underscores, no digit"
             " first."
         )
-    if not (np.isfinite(step) and step > 0.0):
-        raise InputError(f"The step is {step:g} s; give a time above 0, such as 10us.")
+    try:
+        positive = 0.0 < step < np.inf
+    except TypeError:  # a text
+        positive = False
+    if not positive:
+        raise InputError(f"The step is {step!r}; give seconds above 0, such as 1e-5.")
     if precision not in PRECISIONS:
         raise InputError(f"The precision '{precision}' is not known; choose double or single.")
     if hold not in _HELD:

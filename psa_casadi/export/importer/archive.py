@@ -4,6 +4,7 @@ FMUs and SSPs come from anywhere: an archive is looked through before anything o
 """
 
 import math
+import os
 import re
 import stat
 import struct
@@ -161,7 +162,8 @@ class Archive:
             self._held.close()
             if isinstance(error, InputError):
                 raise
-            problem = f"{path}: cannot be read as an FMU ({error}); export it again."
+            reason = str(error).replace(f"{self.directory}{os.sep}", "")
+            problem = f"{path}: cannot be read as an FMU ({reason}); export it again."
             raise InputError(problem) from error
 
     def _read(self) -> None:

@@ -72,7 +72,8 @@ class Fmu(Archive):
         binary = next((p for p in places if p.is_file()), None)
         if binary is None:
             raise InputError(
-                f"{self.path}: has no binary for this machine; export it for this platform."
+                f"{self.path}: has no binary for this machine, binaries/{folders[0]}/{name}; export"
+                " it for this platform."
             )
         try:
             with chdir("."):  # fmpy does not leave the folder of a library that does not load

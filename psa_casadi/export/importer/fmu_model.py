@@ -350,6 +350,8 @@ def _of_equations(
     except PsaError as error:
         if str(error) == TIME_EVENT:
             raise _TimeEventError from error
+        if isinstance(error, InputError):  # of the file, not of its values
+            raise
         raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
     equations = _FmuEquations(imported, read, _definitions(imported, read))
     model = _composed(fmu, read, equations, imported.foreign, name)
