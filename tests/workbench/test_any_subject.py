@@ -14,8 +14,7 @@ from psa_casadi.cli.web import _subject
 from psa_casadi.cli.workbench.desk import Desk
 from psa_casadi.cli.workbench.server import served
 from tests.export.supplied import INFLOW, TIMES, lagged, level, supplied
-from tests.test_files import posix
-from tests.tiers import slow
+from tests.tiers import posix, slow
 from tests.workbench.test_workbench import Tab
 
 FREE = ["area=0.1:4", "outlet=0.001:0.01"]
