@@ -79,7 +79,7 @@ def _amount(size: Size, length: Scale) -> str:
 
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.
-_FILES = ("model.json", "extended.json")
+FILES = ("model.json", "extended.json")
 #: Causes with a remedy, and rivals of each.
 _CAUSES, _RIVALS = 3, 2
 
@@ -134,7 +134,7 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
     stack = d if isinstance(d, StackDiagnosis) else None
     if not (stack or model_file or added(d)):
         return (), ()  # its equations are already there
-    file = model_file or _FILES[added(d)]
+    file = model_file or FILES[added(d)]
     if d.model.structure.foreign:
         around = d.causes and all(c.belongs_to in ("drive", "sensor") for c in d.causes)
         ssp = shlex.quote(str(PurePath(file).with_suffix(".ssp")))

@@ -34,7 +34,7 @@ from psa_casadi.report.words.phrases import (
     rest_sentence,
     scale_of,
 )
-from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
+from psa_casadi.report.words.remedy_words import FILES, effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ def story(
         )
     advice = what_now(d, model_file)
     now = [("what now", text) for text in advice.causes]
-    now += [("then", command) for command in advice.commands[:1]]
+    written = "" if model_file else f" (after -o {FILES[added(d)]})"
+    now += [("then", command + written) for command in advice.commands[:1]]
     lines = _lines(d, origin)
     return labelled([lines[0], *now, *lines[1:]], width)
 
