@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 Lines = Sequence[tuple[str, str]]
 
+#: A noise that is a smaller share of the error is none: the samples are few, or simulated.
+_NO_NOISE = 1e-6
+
 
 def story(
     d: Diagnosis, *, origin: str = "measured", width: int = 100, model_file: str | None = None
@@ -122,6 +125,8 @@ def _displacement_errors(d: StackDiagnosis) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     noise = f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"
+    if d.noise_floor_rms_m < _NO_NOISE * d.base_errors.holdout_rms_m:
+        noise = "none recognised"
     rows = [("base", d.base_errors), ("extended", d.extended_errors)][: 1 + added(d)]
     errors = [(name, say("fit.held_out", e=e, scale=scale)) for name, e in rows]
     return [("noise", noise), *errors]
