@@ -72,14 +72,9 @@ def determinacy(
     errors: FloatArray = np.sqrt(np.maximum(np.diag(of_values), 0.0))
     intervals, undetermined, on_bound = {}, [], []
     for k, name in enumerate(unknowns.names):
-        value, half = fit.model.values[name], NORMAL_95 * float(errors[k])
-        parameter = fit.model.parameter(name)
+        value, parameter = fit.model.values[name], fit.model.parameter(name)
+        intervals[name] = interval_around(fit.model, name, float(errors[k]))
         log = parameter.log and value > 0.0
-        if log:
-            factor = float(np.exp(min(half / value, 50.0)))
-            intervals[name] = Interval(value / factor, value * factor)
-        else:
-            intervals[name] = Interval(value - half, value + half)
         size = value if log else parameter.typical(fit.model.values)
         edge = 1e-6 * abs(unknowns.scale[k])
         vanished = log and value - unknowns.low[k] <= edge
@@ -97,6 +92,18 @@ def determinacy(
         undetermined=tuple(undetermined),
         on_bound=tuple(on_bound),
     )
+
+
+def interval_around(model: Model, name: str, error: float) -> Interval:
+    """Return the 95 % interval of a parameter with a standard error in its unit.
+
+    That of a parameter that spans decades is one of factors.
+    """
+    value, half = model.values[name], NORMAL_95 * error
+    if model.parameter(name).log and value > 0.0:
+        factor = float(np.exp(min(half / value, 50.0)))
+        return Interval(value / factor, value * factor)
+    return Interval(value - half, value + half)
 
 
 def weighted_rows(
