@@ -245,7 +245,7 @@ def test_the_more_noise_the_more_plays() -> None:
         distances = criterion.distances(record)
         chance = {r.name: naming_probability(r, [o], distances, 0.0)
                   for r, o in (pair, pair[::-1])}  # fmt: skip
-        numbers.append(plays_of(criterion, None, record, chance) or np.inf)
+        numbers.append(plays_of(criterion, record, chance) or np.inf)
     assert numbers[0] == 1
     assert 1 < numbers[1] <= 5
     assert numbers[-1] == np.inf

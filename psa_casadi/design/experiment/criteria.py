@@ -308,11 +308,13 @@ class _Refit:
 class Separation:
     """The criterion for rivals under the noise of every output on the record's grid.
 
-    A re-fit ends after `evaluations` while inputs are compared.
+    A re-fit ends after `evaluations` while inputs are compared. `base` is the model without any of
+    the rivals.
     """
 
     rivals: tuple[Rival, ...]
     noise: Sequence[Colour]
+    base: Rival | None = None
     evaluations: int = QUICK
 
     def __post_init__(self) -> None:

@@ -26,8 +26,7 @@ from psa_casadi.design.experiment.criteria import (
     rival_of_model,
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits, limits_of, rest_of
-from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, coarse, search
-from psa_casadi.diagnosis.colour import Colour
+from psa_casadi.design.experiment.search import BRIEF, FINE, GRID, Effort, Make, Plan, search
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
 from psa_casadi.diagnosis.search.state import one_of_each
@@ -141,18 +140,16 @@ def naming_probability(
     return min(chances, default=1.0)
 
 
-def names_all(criterion: Separation, base: Rival | None, record: Signals) -> bool:
+def names_all(criterion: Separation, record: Signals) -> bool:
     """Whether a record names every rival almost certainly, even with less than its distances."""
     try:
         less = {pair: t / _MARGIN for pair, t in criterion.distances(record).items()}
-        return min(chances_of(criterion, less, base, record).values()) > _CERTAIN
+        return min(chances_of(criterion, less, record).values()) > _CERTAIN
     except PsaError:  # a base that cannot follow: another voltage may be better
         return False
 
 
-def plays_of(
-    criterion: Separation, base: Rival | None, record: Signals, chance: Mapping[str, float]
-) -> int | None:
+def plays_of(criterion: Separation, record: Signals, chance: Mapping[str, float]) -> int | None:
     """Return how often a record must be played to name the cause; None if `PLAYS[-1]` do not.
 
     k records of the same voltage are one whose noise has 1/k of the variance.
@@ -161,23 +158,20 @@ def plays_of(
         if plays > 1:
             quieter = [replace(c, level=c.level / np.sqrt(plays)) for c in criterion.noise]
             often = replace(criterion, noise=quieter)
-            chance = chances_of(often, often.distances(record), base, record)
+            chance = chances_of(often, often.distances(record), record)
         if min(chance.values()) >= CHANCE:
             return plays
     return None
 
 
 def chances_of(
-    criterion: Separation,
-    distances: Mapping[tuple[str, str], float],
-    base: Rival | None,
-    record: Signals,
+    criterion: Separation, distances: Mapping[tuple[str, str], float], record: Signals
 ) -> dict[str, float]:
     """Return the probability of every rival that it is named if it is the cause.
 
-    `distances` are those of the record; `base` is the model without any of the rivals.
+    `distances` are those of the record.
     """
-    chances = {}
+    chances, base = {}, criterion.base
     for truth in criterion.rivals:
         others = [r for r in criterion.rivals if r is not truth]
         over = 0.0 if base is None else criterion.distance(truth, base, record)
@@ -191,8 +185,6 @@ USUAL_PERIODS = 10
 _APART = 1.618
 #: Gain of an effect that no record determines, over its ordinary size.
 ORDINARY = 2.5
-#: Samples of the grid on which the result is judged, at most.
-_FINE = 2000
 #: Rivals that a record is designed for, at most: as many as a verdict lists.
 _RIVALS = 5
 
@@ -244,30 +236,7 @@ Limited = Limits | Mapping[str, Limits]
 Noisy = SensorNoise | Sequence[SensorNoise]
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What a search may do: limits of every input, noise of every output, the usual records."""
-
-    limits: Mapping[str, Limits]
-    noise: tuple[SensorNoise, ...]
-    make: Make
-    usual: Mapping[str, Signals]
-
-    @property
-    def whole(self) -> Limits:
-        """Limits of which duration and samples count."""
-        return next(iter(self.limits.values()))
-
-    def colours(self, most: int) -> tuple[Colour, ...]:
-        """Return the noise of every output on a grid of at most this many samples."""
-        return tuple(n.on_grid(self.whole, min(self.whole.samples, most)) for n in self.noise)
-
-    def coarse(self, record: Signals) -> Signals:
-        """Return a record on the grid on which the result is judged."""
-        return coarse(record, min(self.whole.samples, _FINE), self.make)
-
-
-def _plan(model: Model, limits: Limited, noise: Noisy) -> _Plan:
+def _plan(model: Model, limits: Limited, noise: Noisy) -> Plan:
     """Return the plan of a design; the current into a stack limits the rate of its voltage.
 
     Raises InputError where inputs and limits do not fit.
@@ -289,7 +258,7 @@ def _plan(model: Model, limits: Limited, noise: Noisy) -> _Plan:
     make, waves = record_for(model), usual_inputs(steep)
     time = next(iter(every.values())).grid()
     usual = {n: make(n, time, columns) for n, columns in waves.items()}
-    return _Plan(steep, (noise,) if isinstance(noise, SensorNoise) else (*noise,), make, usual)
+    return Plan(steep, (noise,) if isinstance(noise, SensorNoise) else (*noise,), make, usual)
 
 
 def separating_experiment(
@@ -314,20 +283,20 @@ def separating_experiment(
     curves = {c.curve for r in rivals for c in r.model.components if c.name == r.name}
     if _slow(plan.whole) and len(rivals) > 1 and len(curves) == 1 and None not in curves:
         raise InputError(str(note("same_curve", effects=tuple(r.name for r in rivals))))
-    coarser = Separation(tuple(rivals), plan.colours(GRID))
+    coarser = Separation(tuple(rivals), plan.colours(GRID), base)
     usual = plan.usual
     best = search(
-        coarser, plan.limits, plan.make, usual=tuple(usual.values()), kinds=kinds, effort=effort,
-        enough=lambda record: names_all(coarser, base, record), progress=progress,
+        coarser, plan, kinds=kinds, effort=effort, progress=progress,
+        enough=lambda record: names_all(coarser, record),
     )  # fmt: skip
     progress("comparing with a sine and a triangle")
-    criterion = Separation(tuple(rivals), plan.colours(_FINE))
+    criterion = replace(coarser, noise=plan.colours(FINE))
     records = {n: plan.coarse(r) for n, r in {"designed": best.record, **usual}.items()}
     distances = {n: criterion.distances(r) for n, r in records.items()}
     chosen = max(distances, key=lambda n: overall(distances[n].values()))
     if chosen != "designed":
         records["designed"], distances["designed"] = records[chosen], distances[chosen]
-    chances = {n: chances_of(criterion, distances[n], base, r) for n, r in records.items()}
+    chances = {n: chances_of(criterion, distances[n], r) for n, r in records.items()}
     return Separated(
         record=usual.get(chosen, best.record),
         kind=chosen if chosen in usual else best.kind,
@@ -339,7 +308,7 @@ def separating_experiment(
         ),
         chance=chances["designed"],
         usual_chance={n: chances[n] for n in usual},
-        plays=plays_of(criterion, base, records["designed"], chances["designed"]),
+        plays=plays_of(criterion, records["designed"], chances["designed"]),
         evaluations=best.evaluations,
         seconds=clock.perf_counter() - begin,
     )
@@ -366,12 +335,9 @@ def informative_experiment(
     plan = _plan(rival.model, limits, noise)
     wanted = tuple(names) or rival.unknowns.names
     criterion = Information(rival, wanted, optimality, plan.colours(GRID))
-    best = search(
-        criterion, plan.limits, plan.make, usual=tuple(plan.usual.values()), kinds=kinds,
-        effort=effort, progress=progress,
-    )  # fmt: skip
+    best = search(criterion, plan, kinds=kinds, effort=effort, progress=progress)
     progress("comparing with a sine and a triangle")
-    criterion = Information(rival, wanted, optimality, plan.colours(_FINE))
+    criterion = replace(criterion, noise=plan.colours(FINE))
     designed = plan.coarse(best.record)
     value = criterion.at(designed).value
     usual = {n: criterion.at(plan.coarse(r)).value for n, r in plan.usual.items()}

@@ -8,7 +8,7 @@ inputs, each has a waveform of the same family, and p holds the vectors of all.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -142,12 +142,11 @@ class Waveform:
     `slack(p)` is not negative, up to rounding, where rates and times between turns are allowed.
     """
 
-    kind: Kind
     start: FloatArray
     lower: FloatArray
     upper: FloatArray
     values: Callable[[FloatArray, FloatArray], FloatArray]
-    slack: Callable[[FloatArray], FloatArray]
+    slack: Callable[[FloatArray], FloatArray] = lambda _: np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +279,8 @@ def _timed(kind: Kind, limits: Limits, steepest: float, rng: np.random.Generator
     if kind != "free":
         start, low = np.append(levels, shares), np.append(low, np.full(count, -_SPREAD))
         high = np.append(high, np.full(count, 2.0 * _SPREAD))
-    return Waveform(kind, start, low, high, values, slack if limited else _nothing)
+    wave = Waveform(start, low, high, values)
+    return replace(wave, slack=slack) if limited else wave
 
 
 def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Waveform:
@@ -300,27 +300,21 @@ def _multisine(limits: Limits, steepest: float, rng: np.random.Generator) -> Wav
         return np.asarray(np.cos(angle) @ p[: len(lines)] + np.sin(angle) @ p[len(lines) :])
 
     def values(p: FloatArray, time: FloatArray) -> FloatArray:
-        shape = _risen(raw(p, fine), raw(p, fine), fine, first, grow, rest)
-        slope = float(np.max(np.abs(np.diff(shape)))) / (fine[1] - fine[0]) * limits.span
+        whole = raw(p, fine)
+        low, size = np.min(whole), max(np.max(whole) - np.min(whole), 1e-12)
+
+        def risen(wave: FloatArray, at: FloatArray) -> FloatArray:
+            """Return a wave within 0 to 1 that grows from the rest."""
+            inside = (wave - low) / size
+            return np.asarray(rest + (inside - rest) * np.clip((at - first) / grow, 0.0, 1.0))
+
+        slope = np.max(np.abs(np.diff(risen(whole, fine)))) / (fine[1] - fine[0]) * limits.span
         share = min(1.0, steepest / max(slope, _FASTEST_RAMP))
-        wave = np.clip(_risen(raw(p, time), raw(p, fine), time, first, grow, rest), 0.0, 1.0)
+        wave = np.clip(risen(raw(p, time), time), 0.0, 1.0)
         return np.asarray(limits.low + limits.span * (rest + share * (wave - rest)))
 
     amplitude = lines**-0.6
     phase = rng.uniform(0.0, 2.0 * np.pi, len(lines))
     start = np.concatenate([amplitude * np.cos(phase), amplitude * np.sin(phase)])
     edge = np.full(len(start), 2.0)
-    return Waveform("multisine", start, -edge, edge, values, _nothing)
-
-
-def _risen(
-    wave: FloatArray, whole: FloatArray, time: FloatArray, first: float, grow: float, rest: float
-) -> FloatArray:
-    """Scale a wave to 0 to 1 by its extremes over the `whole` record; let it grow from the rest."""
-    low, high = float(np.min(whole)), float(np.max(whole))
-    risen: FloatArray = (wave - low) / max(high - low, 1e-12)
-    return np.asarray(rest + (risen - rest) * np.clip((time - first) / grow, 0.0, 1.0))
-
-
-def _nothing(p: FloatArray) -> FloatArray:
-    return np.zeros(0)
+    return Waveform(start, -edge, edge, values)

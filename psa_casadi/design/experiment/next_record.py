@@ -104,10 +104,20 @@ def design_experiment(
         InputError: limits, names or records do not fit.
         SimulationError: the model cannot follow any of the inputs.
     """
-    rivals, base, left = rivals_of(
-        model, limits, records=records, separate=separate, parameters=parameters, free=free,
-        zeros=zeros, hold=hold, known_start=known_start, progress=progress,
-    )  # fmt: skip
+    if isinstance(records, tuple | list) and not records:
+        records = None
+    if is_stack(model):
+        rivals, base, left = _of_a_stack(model, records, separate, parameters, progress)
+    else:
+        words: dict[str, Any] = {
+            "outputs": model.output_names, "zeros": known_zeros(model, zeros),
+            "known_start": known_start, "hold": hold or "linear",
+        }  # fmt: skip
+        names = tuple(dict.fromkeys([*free_of(model, free), *parameters]))
+        measured = None if records is None else given_to(model, records, hold)
+        rivals, base, left = _of_any_model(
+            model, limits, measured, separate, names, words, progress
+        )
     sensors = left if left and noise is None else noise_of(rivals[0], limits, noise, correlation)
     ready = _resting(model, limits)
     if not separate:
@@ -166,39 +176,24 @@ def noise_of(
     return tuple(SensorNoise(rms_by_output[n], correlation) for n in names)
 
 
-def rivals_of(
-    model: Model,
-    limits: Mapping[str, Limits],
-    *,
-    records: Any = (),
-    separate: Sequence[str | Component] = (),
-    parameters: Sequence[str] = (),
-    free: Sequence[str] | None = None,
-    zeros: Sequence[str] = (),
-    hold: Hold | None = None,
-    known_start: bool = False,
-    progress: Progress = silent,
-) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
-    """Return the models that a record is designed for, the base, and the noise that a fit leaves.
+#: The models that a record is designed for, the base, and the noise that a fit leaves.
+_Rivals = tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]
+
+
+def _of_any_model(
+    model: Model, limits: Mapping[str, Limits], records: Any, separate: Sequence[str | Component],
+    names: Sequence[str], words: dict[str, Any], progress: Progress,
+) -> _Rivals:  # fmt: skip
+    """Return the rivals of a model with free parameters `names`; `words` are fields of a rival.
 
     Without effects the one rival is the model. Raises InputError.
     """
-    if isinstance(records, tuple | list) and not records:
-        records = None
-    if is_stack(model):
-        return _of_a_stack(model, records, separate, parameters, progress)
-    words: dict[str, Any] = {
-        "outputs": model.output_names, "zeros": known_zeros(model, zeros),
-        "known_start": known_start, "hold": hold or "linear",
-    }  # fmt: skip
-    names = tuple(dict.fromkeys([*free_of(model, free), *parameters]))
     runs: tuple[Experiment, ...] = ()
     base: Fit | None = None
     if records is not None:
         runs = experiments_of(
-            model, given_to(model, records, hold), judged=False, zeros=words["zeros"],
-            known_start=known_start,
-        )  # fmt: skip
+            model, records, judged=False, zeros=words["zeros"], known_start=words["known_start"]
+        )
         progress("fitting from several starts")
         base, _ = search_starts(sized(model, runs), runs, names, starts=8)
         runs = base.experiments
@@ -220,12 +215,9 @@ def rivals_of(
 
 
 def _of_a_stack(
-    model: Model,
-    records: Any,
-    separate: Sequence[str | Component],
-    parameters: Sequence[str],
+    model: Model, records: Any, separate: Sequence[str | Component], parameters: Sequence[str],
     progress: Progress,
-) -> tuple[list[Rival], Rival | None, tuple[SensorNoise, ...] | None]:
+) -> _Rivals:  # fmt: skip
     free = [n for n in CORE if n in model.parameter_names]
     if not separate:
         fitted = [n for e in model.effects for n in e.fitted]

@@ -1,7 +1,7 @@
 """The search for the best inputs: many drawn waveforms, the best of them improved by SLSQP."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +10,9 @@ import scipy
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.common.units import FloatArray
-from psa_casadi.design.experiment.criteria import Criterion, Point
+from psa_casadi.design.experiment.criteria import Criterion, Point, SensorNoise
 from psa_casadi.design.experiment.limits import KINDS, Drive, Kind, Limits, draw
+from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra, side_by_side
 from psa_casadi.simulation.stepper import SimulationError
@@ -21,6 +22,8 @@ Make = Callable[[str, FloatArray, Mapping[str, FloatArray]], Signals]
 
 #: Samples of the grid on which inputs are compared, at most, and a cycle's samples on it.
 GRID, _CYCLE = 500, 8
+#: Samples of the grid on which the result is judged, at most.
+FINE = 2000
 #: Step of the gradient by a coordinate, of which 1 is a whole range.
 _STEP = 1e-3
 _POOR = -1e3
@@ -40,6 +43,38 @@ class Effort:
 BRIEF = Effort(draws=6, starts=1, steps=5)
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a search may do: limits of every input, noise of every output, the usual records.
+
+    `limits` have `rate` as the steepest change; `make` makes a record.
+    """
+
+    limits: Mapping[str, Limits]
+    noise: tuple[SensorNoise, ...]
+    make: Make
+    usual: Mapping[str, Signals]
+
+    @property
+    def whole(self) -> Limits:
+        """Limits of which duration and samples count."""
+        return next(iter(self.limits.values()))
+
+    def colours(self, most: int) -> tuple[Colour, ...]:
+        """Return the noise of every output on a grid of at most this many samples."""
+        return tuple(n.on_grid(self.whole, min(self.whole.samples, most)) for n in self.noise)
+
+    def coarse(self, record: Signals, most: int = FINE) -> Signals:
+        """Return a record on a grid of at most this many samples."""
+        samples = min(self.whole.samples, most)
+        if record.n <= samples:
+            return record
+        spacing = record.sample_time * record.n / samples
+        time: FloatArray = spacing * np.arange(samples, dtype=np.float64)
+        inputs = {n: np.interp(time, record.time, c) for n, c in record.columns.items()}
+        return self.make(record.name, time, inputs)
+
+
 @dataclass(frozen=True, eq=False)
 class Best:
     """The best record in full, its family, and values and gradients it took."""
@@ -52,10 +87,8 @@ class Best:
 @one_thread_of_algebra()
 def search(
     criterion: Criterion,
-    limits: Mapping[str, Limits],
-    make: Make,
+    plan: Plan,
     *,
-    usual: Sequence[Signals] = (),
     kinds: Sequence[Kind] = KINDS,
     effort: Effort | None = None,
     enough: Callable[[Signals], bool] = lambda _: False,
@@ -63,18 +96,17 @@ def search(
 ) -> Best:
     """Draw waveforms of the families, improve the best ones, return the best of all.
 
-    `limits` are those of every input, with `rate` as the steepest change; `make` makes a record.
-    A `usual` record within the limits that is better than all is returned in place of them.
-    Once the best record, on the comparison's grid, is `enough`, nothing is improved any more.
+    A usual record that is better than all is returned in place of them. Once the best record, on
+    the comparison's grid, is `enough`, nothing is improved any more.
 
     Gradients are exact in the trajectories' derivatives by delta and differences by the waveform's
     coordinates, evaluated side by side. Raises SimulationError where no waveform can be simulated.
     """
     effort = effort or Effort()
-    problem, rng = _Problem(criterion, limits, make), np.random.default_rng(effort.seed)
+    problem, rng = _Problem(criterion, plan), np.random.default_rng(effort.seed)
     # no faster than the grid of the comparison can show
-    band = len(problem.time) / problem.limits.duration / _CYCLE
-    slower = {n: replace(each, bandwidth=min(each.band, band)) for n, each in limits.items()}
+    band = len(problem.time) / plan.whole.duration / _CYCLE
+    slower = {n: replace(each, bandwidth=min(each.band, band)) for n, each in plan.limits.items()}
     pool = [
         Drive(kind, {n: draw(kind, item, item.rate, rng) for n, item in slower.items()})
         for kind in kinds
@@ -97,46 +129,39 @@ def search(
         better = value > best
         if better:
             best, winner = value, (pool[k], p)
-    record = replace(problem.record(*winner, problem.limits.grid()), name="designed")
+    record = replace(problem.record(*winner, plan.whole.grid()), name="designed")
     kind = str(winner[0].kind)
-    for other in usual:
-        value = problem.of(coarse(other, len(problem.time), make)).value
+    for other in plan.usual.values():
+        value = problem.of(plan.coarse(other, GRID)).value
         if value > best:
             best, record, kind = value, other, other.name
     return Best(record, kind, problem.evaluations)
 
 
-def coarse(record: Signals, samples: int, make: Make) -> Signals:
-    """Return a record on a grid of at most this many samples."""
-    if record.n <= samples:
-        return record
-    spacing = record.sample_time * record.n / samples
-    time: FloatArray = spacing * np.arange(samples, dtype=np.float64)
-    inputs = {n: np.interp(time, record.time, c) for n, c in record.columns.items()}
-    return make(record.name, time, inputs)
-
-
+@dataclass
 class _Problem:
     """The criterion as a function of a drive's coordinates, with its gradient."""
 
-    def __init__(self, criterion: Criterion, limits: Mapping[str, Limits], make: Make) -> None:
-        self._criterion, self._every, self._make = criterion, limits, make
-        self.limits = next(iter(limits.values()))  # of all the same: duration and samples
-        self.time = self.limits.grid(min(self.limits.samples, GRID))
-        self.evaluations = 0
+    criterion: Criterion
+    plan: Plan
+    evaluations: int = 0
+    time: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.time = self.plan.whole.grid(min(self.plan.whole.samples, GRID))
 
     def record(self, drive: Drive, p: FloatArray, time: FloatArray | None = None) -> Signals:
         """Return the planned record on the grid, or at instants [s]."""
         at = self.time if time is None else time
         columns = drive.columns(p, at)
-        ends = {n: (self._every[n].low, self._every[n].high) for n in columns}
-        return self._make(drive.kind, at, {n: np.clip(c, *ends[n]) for n, c in columns.items()})
+        ends = {n: (each.low, each.high) for n, each in self.plan.limits.items()}
+        return self.plan.make(drive.kind, at, {n: np.clip(c, *ends[n]) for n, c in columns.items()})
 
     def of(self, record: Signals) -> Point:
         """Return the criterion at a record; a poor value where the models cannot follow."""
         self.evaluations += 1
         try:
-            return self._criterion.at(record)
+            return self.criterion.at(record)
         except PsaError:
             return Point(_POOR, lambda _: 0.0)
 

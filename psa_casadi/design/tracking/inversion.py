@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
-import scipy
 
 from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.common.units import FloatArray
@@ -25,6 +24,7 @@ from psa_casadi.design.tracking.targets import (
     Response,
     Target,
     TrackingError,
+    behind_drive,
     demand_stack,
     error_of,
     held,
@@ -181,12 +181,7 @@ def _voltage(model: Model, even: Target, wanted: FloatArray, rest: float) -> Flo
     if "h_ref" in p:
         constant, dt, n = p["R_s"] * p["C_p"], even.step / _PARTS, len(wanted)
         fine = np.interp(np.arange((n - 1) * _PARTS + 1) / _PARTS, np.arange(n), wanted)
-        # the drive's exact answer to a line through samples, from rest
-        inputs, decay = p["G"] * fine, np.exp(-dt / constant)
-        later = 1.0 - constant / dt * (1.0 - decay)
-        upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
-        state = [inputs[0] * (1.0 - later)]
-        behind = scipy.signal.lfilter(upper, lower, inputs, zi=state)[0]
+        behind = behind_drive(model, dt, p["G"] * fine, p["G"] * fine[0])
         march = _march(model).mapaccum("march", len(fine) - 1)
         u = np.array(march(ca.DM([behind[0], 0.0]), np.diff(behind)[None, :], dt)).T
         u = np.concatenate([[behind[0]], u[:, 0]])

@@ -22,7 +22,13 @@ import scipy
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.design.tracking.targets import AmplifierLimits, Response, move_start, respond
+from psa_casadi.design.tracking.targets import (
+    AmplifierLimits,
+    Response,
+    behind_drive,
+    move_start,
+    respond,
+)
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import slopes_at_rest
 
@@ -166,13 +172,8 @@ class LinearMove:
     def _current(self, h: float) -> tuple[FloatArray, FloatArray]:
         """Return i_k = (G v_k - u_k) / R_s at the knots: times the voltage, and rest."""
         p = self.model.values
-        decay = np.exp(-h / (p["R_s"] * p["C_p"]))
-        later = 1.0 - p["R_s"] * p["C_p"] / h * (1.0 - decay)
-        before = 1.0 - decay - later
-        upper, lower = [later, before], [1.0, -decay]
-        rest = [decay * self.rest + before * self.rest]
-        u = scipy.signal.lfilter(upper, lower, np.eye(self.n), axis=0)
-        free = scipy.signal.lfilter(upper, lower, np.zeros(self.n), zi=rest)[0]
+        u = behind_drive(self.model, h, np.eye(self.n), 0.0)
+        free = behind_drive(self.model, h, np.zeros(self.n), self.rest)
         scale = p["G"] / p["R_s"]
         return scale * (np.eye(self.n) - u), -scale * free
 

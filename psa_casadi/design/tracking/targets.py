@@ -6,6 +6,7 @@ from math import inf
 
 import casadi as ca
 import numpy as np
+import scipy
 
 from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.common.units import BoolArray, FloatArray, parse_unit, to_si
@@ -158,6 +159,19 @@ def respond(model: Model, time: FloatArray, voltage: FloatArray, rtol: float = R
     row = model.output_names.index
     current = steps.y[:, row("current")] if "current" in model.output_names else 0.0 * time
     return Response(time, voltage, steps.y[:, row("displacement")], current, steps.x)
+
+
+def behind_drive(model: Model, step: float, command: FloatArray, rest: float) -> FloatArray:
+    """Return the voltage behind the drive (n, ...) for a command (n, ...) at its gain [V].
+
+    The command goes in lines between samples every `step` [s], from rest at a voltage; exact.
+    """
+    constant = model.values["R_s"] * model.values["C_p"]
+    decay = np.exp(-step / constant)
+    later = 1.0 - constant / step * (1.0 - decay)
+    upper, lower = [later, 1.0 - decay - later], [1.0, -decay]
+    state = np.full((1, *command.shape[1:]), rest * (1.0 - later))
+    return np.asarray(scipy.signal.lfilter(upper, lower, command, axis=0, zi=state)[0])
 
 
 def error_of(target: Target, displacement: FloatArray) -> TrackingError:
