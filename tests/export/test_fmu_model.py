@@ -174,6 +174,19 @@ def test_model_json_names_the_fmu_by_its_hash(tmp_path: Path) -> None:
     assert (tmp_path / "again.json").read_bytes() == file.read_bytes()
 
 
+def test_a_saved_model_finds_its_fmu_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fmu, folder = tmp_path / "swing.fmu", tmp_path / "models"
+    fmu.write_bytes(pendulum().read_bytes())
+    folder.mkdir()
+    psa.save_model(psa.fmu_model(fmu, free=FREE), folder / "swing.json")
+    with pytest.raises(psa.InputError, match=r"models.swing\.fmu is not there"):
+        psa.load_model(folder / "swing.json")
+    monkeypatch.chdir(tmp_path)
+    assert psa.load_model(folder / "swing.json").output_names == ("reach", "speed")
+
+
 def test_another_fmu_than_the_saved_one_is_refused(tmp_path: Path) -> None:
     fmu, file = tmp_path / "swing.fmu", tmp_path / "model.json"
     fmu.write_bytes(pendulum().read_bytes())

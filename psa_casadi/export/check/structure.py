@@ -104,13 +104,12 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
         if entry.dependencies is None:
             yield f"'{entry.variable.name}' lists no dependencies"
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
-    table: dict[str, set[str]] = {name: set() for name in unknowns}
+    pairs = set[tuple[str, str]]()
     for instance, point in _at_points(fmu, 1):
         moved = {n: 1.01 * v for n, v in point.items()}
-        for name, known in movements(instance, point, unknowns, moved):
-            table[name].add(known)
+        pairs.update(movements(instance, point, unknowns, moved))
     claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
-    missing = {(name, known) for name, claimed in claims for known in table[name] - claimed}
+    missing = {(n, k) for n, k in pairs for name, known in claims if n == name and k not in known}
     for name, known in sorted(missing):
         yield f"'{name}' depends on '{known}', which its dependencies do not list"
 

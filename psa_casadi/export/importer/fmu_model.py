@@ -414,30 +414,31 @@ def load_model(
 
     Equations in the file are read as text, none of it is run. The binary of an FMU that the model
     has runs in this process: `fmu` is that FMU or the folder with it, by default the folder of
-    MODEL.json.
+    MODEL.json, and where that has not the FMU of its SHA-256 the current folder.
 
     Raises InputError with every unknown name, missing or bad value, and for an FMU that is not
     there or has another SHA-256 than when the model was saved.
     """
-    place = Path(path).parent if fmu is None else Path(fmu)
-    return model_of(read_content(path), str(path), effects, partial(_component_at, place))
+    places = [Path(path).parent, Path()] if fmu is None else [Path(fmu)]
+    return model_of(read_content(path), str(path), effects, partial(_component_at, places))
 
 
 def _component_at(
-    place: Path, used: FmuUsed, name: str, parameters: tuple[Parameter, ...]
+    places: Sequence[Path], used: FmuUsed, name: str, parameters: tuple[Parameter, ...]
 ) -> Component:
-    """Return the component of an FMU that lies at a place, or in it, with these parameters.
+    """Return the component of an FMU that lies at one of the places, or in it.
 
     Raises InputError where there is no such file or it has another SHA-256, and as `fmu_model`.
     """
     if PurePath(used.file).name != used.file:
         return no_fmu(used, name, parameters)
-    file = place / used.file if place.is_dir() else place
-    there = file.is_file()
-    if not there or digest_of(file) != used.sha256:
+    files = [place / used.file if place.is_dir() else place for place in places]
+    file = next((f for f in files if f.is_file() and digest_of(f) == used.sha256), None)
+    if file is None:
+        there = files[0].is_file()
         why = "is another FMU than the one it was saved with" if there else "is not there"
         raise InputError(
-            f"the model has the FMU '{used.file}' (sha256 {used.sha256}), and {file} {why}; put"
+            f"the model has the FMU '{used.file}' (sha256 {used.sha256}), and {files[0]} {why}; put"
             " that FMU there, or type psa.load_model(MODEL, fmu=FMU) with the place where it is."
         )
     if len(parameters) != len(used.parameters):

@@ -154,7 +154,7 @@ def integrate(
             maxNumSteps=_MOST_STEPS,
         )  # fmt: skip
         rows = [instance.get(outputs)]
-        for target in times[1:].tolist():
+        for k, target in enumerate(times[1:].tolist(), 1):
             while now < target - same:
                 happened, _, now = solver.step(now, min(target, event))
                 fmi.setTime(now)
@@ -170,7 +170,7 @@ def integrate(
                     apply(now, event=True)
                     event = instance.leave_event_mode()
                     solver.reset(now)
-            if not held:
+            if len(rows) == k:
                 rows.append(instance.get(outputs))
         return np.array(rows)
 
