@@ -37,6 +37,13 @@ def _inserted(value: Any) -> Any:
     return phrases.quantity(*value) if is_quantity else ", ".join(map(str, value))
 
 
+def _formatted(value: Any, form: str) -> str:
+    """Return a number in a format; that of a quantity (value, unit) with its unit behind it."""
+    if isinstance(value, tuple):
+        return phrases.with_unit(format(value[0], form), value[1])
+    return format(value, form)
+
+
 def _of_quantity(show: Callable[..., str]) -> Callable[..., str]:
     """Return what shows a value and a unit, or the two as one quantity."""
     return lambda value, *unit: show(*(value if isinstance(value, tuple) else (value, *unit)))
@@ -115,7 +122,7 @@ CATALOGUE.filters |= {name: getattr(phrases, name) for name in _OF_PHRASES}
 CATALOGUE.filters |= {
     "correlation": lambda value: f"{value:.2f}".replace("-", "−"),
     "estimate": _estimate,
-    "fmt": format,
+    "fmt": _formatted,
     "frequencies": _frequencies,
     "instants": _instants,
     "plural": plural,
