@@ -39,7 +39,13 @@ from psa_casadi.identification.search import (
     without_column,
 )
 from psa_casadi.identification.start import doubts
-from psa_casadi.identification.start.ordinary import Hysteresis, chosen_start, forms_of
+from psa_casadi.identification.start.ordinary import (
+    Hysteresis,
+    chosen_start,
+    forms_of,
+    starting_model,
+    stuck_values,
+)
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
@@ -343,6 +349,10 @@ def _prepared(
         clean, judged = _on_one_clock(clean, notes), _on_one_clock(judged, notes)
     (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
     start, scale_given = chosen_start(clean, model, stiffness)
+    if stuck := stuck_values(start):
+        values = starting_model(clean, start.values.get("k_B")).values
+        start = start.with_values({n: v for n, v in values.items() if n in start.values})
+        notes.append(note("stuck_start", names=stuck))
     (clean, long), (judged, long_too) = excerpts(clean), excerpts(judged)
     experiments = divided(clean, judged)
     columns = columns_of(start, [e.record for e in experiments])

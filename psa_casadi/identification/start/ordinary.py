@@ -266,6 +266,22 @@ def chosen_start(
     return model.with_values(scaled), True
 
 
+def stuck_values(model: Model) -> tuple[str, ...]:
+    """Return the fitted parameters that are on a bound, without gains and lags that vanish.
+
+    A base fit that lacks an effect may leave the physical range to imitate it, as a damping of
+    1e9 N.s/m imitates creep; from there the effect does not show.
+    """
+    stuck = []
+    for name in model.provenance.free:
+        parameter, value = model.parameter(name), model.values[name]
+        low, high = parameter.bounds
+        vanishes = parameter.log or low == 0.0
+        if value >= high - 1e-9 * abs(high) or (not vanishes and value <= low + 1e-9 * abs(low)):
+            stuck.append(name)
+    return tuple(stuck)
+
+
 def loop_starts(model: Model) -> list[dict[str, float]]:
     """Return starting values for the hysteresis, scaled to the model's k_L."""
     k_l = model.values["k_L"]
