@@ -50,7 +50,7 @@ def test_mode_of_an_old_file_and_the_target_of_a_link_are_kept(tmp_path: Path) -
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
 
-def test_a_new_file_is_readable_as_the_umask_allows(tmp_path: Path) -> None:
+def test_a_new_file_is_readable_by_the_umask(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     atomic_write(tmp_path / "ours", "")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -84,7 +84,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         atomic_write(tmp_path / "file" / "below", "")
 
 
-def test_an_input_error_has_one_problem_on_each_line() -> None:
+def test_an_input_error_states_one_problem_on_each_line() -> None:
     error = InputError(["first.", "second."])
     assert {PsaError, ValueError} < {*type(error).__mro__}
     assert error.problems == ("first.", "second.")
