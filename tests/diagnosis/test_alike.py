@@ -5,24 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.cli import diagnosis_files as files
-from psa_casadi.common.errors import InputError
 from psa_casadi.design.experiment.experiment import resolving_experiment
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.search.steps import one_of_each
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records.read.reading import read_record
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
-from psa_casadi.simulation.simulate import simulate
 from tests.studies.plants.make import make_record
 from tests.tiers import slow
 
-TABLE = tuple(EFFECTS.values())
+TABLE = tuple(psa.EFFECTS.values())
 BENDS = ("load_stiffness", "sensor_nonlinearity")
 
 
@@ -34,9 +27,9 @@ def test_bends_are_alike_where_no_resonance_shows(
     rate: float, free: list[str], alike: tuple[tuple[str, ...], ...]
 ) -> None:
     time = np.arange(200) / rate
-    model, voltage = compose(BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
-    displayed = simulate(model, time, voltage).displacement
-    experiments = (split(Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
+    model, voltage = psa.compose(psa.BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
+    displayed = psa.simulate(model, time, voltage).displacement
+    experiments = (split(psa.Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
     result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
     groups = Task(experiments, TABLE, STACK).indistinguishable(result)
     assert tuple(tuple(sorted(group)) for group in groups) == alike
@@ -47,8 +40,8 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     """The bend's entry is in the table; an arc tangent is no polynomial."""
     path = tmp_path / "a.csv"
     make_record("sensor_nonlinearity", 1, path, visible=(2.0, 2.5))
-    record = read_record(path).slice(0, 3000)
-    result = diagnose([record], effects=[EFFECTS[n] for n in BENDS])
+    record = psa.read_record(path).slice(0, 3000)
+    result = psa.diagnose([record], effects=[psa.EFFECTS[n] for n in BENDS])
     assert result.verdict == "ambiguous"
     (cause,) = result.causes
     assert {cause.effect, *cause.cannot_be_told_from} == set(BENDS)
@@ -58,6 +51,6 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     assert "no voltage below the resonances separates" in result.next_experiment.why
     output, _ = one_of_each(result.contenders, result.experiments)
     assert len(output) == 1
-    with pytest.raises(InputError, match="bend the same curve"):
+    with pytest.raises(psa.InputError, match="bend the same curve"):
         resolving_experiment(result)
     assert files.with_next(result, tmp_path / "next.csv", lambda _: None) is result

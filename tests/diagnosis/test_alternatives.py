@@ -10,21 +10,19 @@ from typer.testing import CliRunner
 import psa_casadi as psa
 from psa_casadi.cli.app import app
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records.record import Record
-from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow
 
 NOISE = 5e-9
-TABLE = [EFFECTS[n] for n in ("sensor_nonlinearity", "load_stiffness", "slow_creep", "sensor_lag")]
+TABLE = [
+    psa.EFFECTS[n] for n in ("sensor_nonlinearity", "load_stiffness", "slow_creep", "sensor_lag")
+]
 TIME = np.linspace(0.0, 5.998, 3000)
 
 
 def _reading() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return voltage, the reading of a bent sensor, and the bend alone [m]."""
     voltage = 55.0 - 35.0 * np.cos(2 * np.pi * TIME) - 15.0 * np.sin(2 * np.pi * 0.37 * TIME)
-    x = simulate(stack_model("P-885.51"), TIME, voltage).displacement
+    x = psa.simulate(psa.stack_model("P-885.51"), TIME, voltage).displacement
     place = (x - x.min()) / np.ptp(x)
     bend = 0.02 * np.ptp(x) * place * (1.0 - place)
     noise = NOISE * np.random.default_rng(5).standard_normal(x.size)
@@ -36,7 +34,7 @@ def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
     """One plant has the bend, the other leaves it to the sensor: apart they are the bend itself."""
     voltage, reading, bend = _reading()
     d = psa.diagnose(
-        [Record(name="r", time=TIME, voltage=voltage, displacement=reading)], effects=TABLE
+        [psa.Record(name="r", time=TIME, voltage=voltage, displacement=reading)], effects=TABLE
     )
     assert d.verdict == "ambiguous"
     (a,) = d.alternatives
@@ -63,7 +61,7 @@ def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Pa
     psa.write_record(
         record, {"time [s]": TIME, "voltage [V]": voltage, "displacement [m]": reading}
     )
-    rest = [f"--leave-out={name}" for name, effect in EFFECTS.items() if effect not in TABLE]
+    rest = [f"--leave-out={name}" for name, effect in psa.EFFECTS.items() if effect not in TABLE]
     done = CliRunner().invoke(app, ["diagnose", str(record), "-o", str(out), *rest])
     assert done.exit_code == 0, done.output
     (other,) = set(tmp_path.glob("ext_*.json"))

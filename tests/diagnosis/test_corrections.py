@@ -5,18 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
 from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
-from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow_but
 
 TIME: FloatArray = np.linspace(0.0, 4.0, 2001)
@@ -26,8 +22,8 @@ NOISE = 2e-9
 
 
 def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
-    experiments = (split(Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
-    result = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
+    experiments = (split(psa.Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
+    result = fit(psa.compose(psa.BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
     return result, experiments, Colour((np.zeros(0),), NOISE, (len(result.residuals),))
 
 
@@ -37,7 +33,7 @@ def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
 
 @pytest.fixture(scope="module")
 def clean() -> FloatArray:
-    return simulate(compose(BASE), TIME, VOLTAGE).displacement
+    return psa.simulate(psa.compose(psa.BASE), TIME, VOLTAGE).displacement
 
 
 def _measured(clean: FloatArray, added: FloatArray) -> FloatArray:
@@ -115,7 +111,7 @@ def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
     modes = [c for c in corrections(result, experiments, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
-    with pytest.raises(InputError, match="no form that a model could hold"):
+    with pytest.raises(psa.InputError, match="no form that a model could hold"):
         with_patch(result, patch, experiments, result.predicted(experiments))
 
 
@@ -136,7 +132,7 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     time: FloatArray = np.arange(4000, dtype=float) * 1e-3
     experiments = (
         Experiment(
-            Record(name="r", time=time, voltage=time, displacement=truth + noise), ~held, held
+            psa.Record(name="r", time=time, voltage=time, displacement=truth + noise), ~held, held
         ),
     )
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))

@@ -4,11 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from psa_casadi.diagnosis.diagnose import diagnose
+import psa_casadi as psa
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records.read.reading import read_record
-from psa_casadi.records.record import Record
 from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow
 
@@ -19,9 +16,9 @@ def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
     pairs = zip(("a", "b"), ends, strict=True)
-    records = [read_record(tmp_path / f"{n}.csv").slice(0, end) for n, end in pairs]
-    effects = [EFFECTS["offset_drift"]]
-    one, other = (diagnose(r, effects=effects) for r in (records, records[::-1]))
+    records = [psa.read_record(tmp_path / f"{n}.csv").slice(0, end) for n, end in pairs]
+    effects = [psa.EFFECTS["offset_drift"]]
+    one, other = (psa.diagnose(r, effects=effects) for r in (records, records[::-1]))
     for mine, yours in zip(one.experiments, other.experiments, strict=True):
         np.testing.assert_array_equal(measured(mine.record), measured(yours.record))
     assert one.extended_errors == other.extended_errors
@@ -33,9 +30,9 @@ def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
     """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"
     make_record("drive_lag", 52001, path, gain=9.171e-4)
-    record = read_record(path)
+    record = psa.read_record(path)
     names = ("rate_dependent_hysteresis", "voltage_saturation", "preload_loss", "load_stiffness")
-    result = diagnose([record], effects=[EFFECTS[n] for n in (*names, "drive_lag")])
+    result = psa.diagnose([record], effects=[psa.EFFECTS[n] for n in (*names, "drive_lag")])
     assert result.verdict == "cause_named"
     assert [c.effect for c in result.causes] == ["drive_lag"]
 
@@ -46,7 +43,7 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
 ) -> None:
     """Seven standard deviations of the noise off, two of what a hum leaves of the base fit."""
     truth = make_record("mains_hum", 3, tmp_path / "a.csv", excitation="triangle", visible=3.0)
-    inputs = read_record(tmp_path / "a.csv").slice(0, 1200)
+    inputs = psa.read_record(tmp_path / "a.csv").slice(0, 1200)
     counts = 0.7 * truth.sigma
     y = counts * np.round(measured(inputs) / counts)
     moves = np.abs(np.diff(truth.displacement[:1200], prepend=0.0))
@@ -57,8 +54,8 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
             y[k : k + length] = y[k - 1]
             stuck.append(k + length - 1)
     assert len(stuck) > 10
-    record = Record(name="a", time=inputs.time, voltage=inputs.voltage, displacement=y)
-    result = diagnose([record], effects=[EFFECTS["mains_hum"]])
+    record = psa.Record(name="a", time=inputs.time, voltage=inputs.voltage, displacement=y)
+    result = psa.diagnose([record], effects=[psa.EFFECTS["mains_hum"]])
     used = result.experiments[0].record.mask
     assert [c.effect for c in result.causes] == ["mains_hum"]
     assert np.mean(used[stuck]) < 0.4

@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.probes import residual_jumps
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
-from psa_casadi.simulation.simulate import simulate
 
 
 def _loops() -> tuple[FloatArray, FloatArray]:
@@ -21,12 +18,12 @@ def _loops() -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.85])
 def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
     """Under noise as large as half the jump; in the model's displacement, whatever the offset."""
-    model = compose(BASE)
+    model = psa.compose(psa.BASE)
     t, voltage = _loops()
-    x = simulate(model, t, voltage).displacement
+    x = psa.simulate(model, t, voltage).displacement
     noise = 1e-8 * np.random.default_rng(4).standard_normal(t.size)
     place = float(x.min() + share * np.ptp(x))
     reading = x + 2e-8 * (x > place) + noise + 3e-6
-    experiments = (whole(Record(name="r", time=t, voltage=voltage, displacement=reading)),)
+    experiments = (whole(psa.Record(name="r", time=t, voltage=voltage, displacement=reading)),)
     places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
     assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)

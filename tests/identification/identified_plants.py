@@ -8,30 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.identification.identify import StackIdentification, identify
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, read_record
 from psa_casadi.records.split import whole
 from tests.studies.plants.make import Truth, make_record
 from tests.studies.plants.stack import Stack, loop_width
 
 
 @cache
-def plant(seed: int) -> tuple[Truth, Record]:
+def plant(seed: int) -> tuple[Truth, psa.Record]:
     """Return a plant without a hidden effect and its record."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "record.csv")
-        return make_record(None, seed, path), read_record(path)
+        return make_record(None, seed, path), psa.read_record(path)
 
 
 @cache
-def identified(seed: int) -> StackIdentification:
-    return identify([plant(seed)[1]])
+def identified(seed: int) -> psa.StackIdentification:
+    return psa.identify([plant(seed)[1]])
 
 
 def noise(truth: Truth) -> float:
@@ -75,14 +71,14 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
 IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
 
 
-def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
+def same_as_the_named_stack(rms: float, record: psa.Record, name: str) -> None:
     """The named stack meets its record as well as any values of what was identified for it.
 
     A search from nothing is at least as good. It may be better: it frees masses besides, and in the
     demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
     c_P on its bound, with a warning. Offset and memory are fitted.
     """
-    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
+    model = psa.compose(psa.BASE, {k: f.value for k, f in psa.STACKS[name].values.items()})
     y: FloatArray = np.asarray(record.displacement)
     result = fit(model, [whole(record)], [], sigma=[rms])
     again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])

@@ -6,39 +6,37 @@ from typing import Any
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.search import free_parameters
-from psa_casadi.model.compose import Model
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records import multisine, time_grid
 from psa_casadi.records.split import Experiment, whole
 from psa_casadi.simulation.exact.run import run_exact
-from psa_casadi.simulation.simulate import EXACT, STEPPER, Way, simulate
+from psa_casadi.simulation.simulate import EXACT, STEPPER, Way
 from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.stepper import run
 from tests.identification.test_fit import model_with
 from tests.simulation.exact_cases import OUTPUT, composite, inputs, times, with_effect
 
 SIGMA, SAMPLES, STEP = 2e-8, 300, 2e-3
 
 
-def record_at(time: FloatArray, sigma: float, seed: int = 1) -> Record:
+def record_at(time: FloatArray, sigma: float, seed: int = 1) -> psa.Record:
     """Return a record of the demo stack under a multisine that is linear between `time`."""
     grid = time_grid(STEP * SAMPLES, STEP)
     voltage = np.interp(time, grid, multisine(grid, 2.0, 60.0, (3.0, 40.0), seed=seed))
-    x = simulate(model_with(), time, voltage, rtol=1e-9).displacement
+    x = psa.simulate(model_with(), time, voltage, rtol=1e-9).displacement
     white = np.random.default_rng(seed).standard_normal(len(time))
-    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x + sigma * white)
+    return psa.Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x + sigma * white)
 
 
-def regular(sigma: float = SIGMA, seed: int = 1) -> Record:
+def regular(sigma: float = SIGMA, seed: int = 1) -> psa.Record:
     return record_at(time_grid(STEP * SAMPLES, STEP), sigma, seed)
 
 
 def fitted(experiments: list[Experiment], sigma: float, rtol: float = FIT_RTOL) -> Fit:
-    model: Model = model_with()
+    model: psa.Model = model_with()
     start = {"k_L": 1.05 * model.values["k_L"], "tau": 1.5 * model.values["tau"]}
     levels = [sigma] * len(experiments)
     return fit(model, experiments, free_parameters(model), sigma=levels, start=start, rtol=rtol)
@@ -86,7 +84,7 @@ def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit
 
 
-def jittered(sigma: float, seed: int = 1) -> Record:
+def jittered(sigma: float, seed: int = 1) -> psa.Record:
     """Return the record at instants that are off by a thousandth of a sample."""
     shift = 1e-3 * STEP * np.random.default_rng(5).standard_normal(SAMPLES)
     shift[0] = 0.0
@@ -94,27 +92,27 @@ def jittered(sigma: float, seed: int = 1) -> Record:
 
 
 BASE_UNKNOWNS = ("R_s", "C_p", "k_L", "A", "beta", "gamma", "delta", "n", "tau", "k_P", "c_B")
-NAMES = ("base", *EFFECTS)
+NAMES = ("base", *psa.EFFECTS)
 DERIVED_SAMPLES, DERIVED_STEP = 240, 2e-4
 #: What a run at 1e-8 may be off, over the largest value of a column; that of delta jumps.
 ALLOWED, OF_DELTA = 2e-3, 1e-2
 
 
-def unknowns_of(name: str, model: Model) -> list[str | int]:
+def unknowns_of(name: str, model: psa.Model) -> list[str | int]:
     """Return the effect's parameters, some of the base, and initial states."""
-    item = [] if name == "base" else [p.name for p in EFFECTS[name].parameters]
+    item = [] if name == "base" else [p.name for p in psa.EFFECTS[name].parameters]
     memories = [s.name for s in model.structure.states if s.memory]
     starts = [model.state_names.index(n) for n in (*memories, "f_out")]
     return [*item, *BASE_UNKNOWNS, *starts]
 
 
-def derived_record(model: Model) -> tuple[FloatArray, FloatArray, FloatArray]:
+def derived_record(model: psa.Model) -> tuple[FloatArray, FloatArray, FloatArray]:
     t = times(DERIVED_SAMPLES, DERIVED_STEP)
     u = inputs(model, t, composite(DERIVED_SAMPLES))
     return t, u, start_on(model, t, u).x
 
 
-def initial(model: Model, unknowns: list[str | int]) -> FloatArray:
+def initial(model: psa.Model, unknowns: list[str | int]) -> FloatArray:
     s0 = np.zeros((len(model.state_names), len(unknowns)))
     for column, unknown in enumerate(unknowns):
         if isinstance(unknown, int):
@@ -130,7 +128,7 @@ def columns(name: str, tolerance: float) -> tuple[list[str | int], FloatArray, F
     s0 = initial(model, unknowns)
     requested: Any = {"unknowns": unknowns, "s0": s0, "outputs": (OUTPUT,)}
     exact_steps = run_exact(model, t, u, x0, tolerance=tolerance, **requested)
-    item = run(model, t, u, x0, rtol=1e-12, **requested)
+    item = psa.run(model, t, u, x0, rtol=1e-12, **requested)
     return unknowns, exact_steps.sensitivity[:, 0], item.sensitivity[:, 0]
 
 

@@ -6,40 +6,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit, Objective, fit
 from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.refitting import same_place
 from psa_casadi.identification.search import fit_base, free_parameters
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records import multisine, time_grid
 from psa_casadi.records.split import Experiment, divided, whole
-from psa_casadi.simulation.simulate import Way, simulate
+from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.stepper import SimulationError
 from tests.tiers import slow
 
 SIGMA = 2e-8
 
 
-def model_with(*effects: str) -> Model:
-    model = stack_model("demo").with_values({"delta": -0.5, "n": 1.3})
+def model_with(*effects: str) -> psa.Model:
+    model = psa.stack_model("demo").with_values({"delta": -0.5, "n": 1.3})
     for name in effects:
-        model = model.with_effect(EFFECTS[name])
+        model = model.with_effect(psa.EFFECTS[name])
     gains = {"creep_gain": 0.04, "delta_r": 0.02}
     return model.with_values({k: v for k, v in gains.items() if k in model.values})
 
 
-def record_of(model: Model, seed: int, samples: int = 400) -> Record:
+def record_of(model: psa.Model, seed: int, samples: int = 400) -> psa.Record:
     time = time_grid(2e-3 * samples, 2e-3)
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
     white = SIGMA * np.random.default_rng(seed).standard_normal(samples)
-    x = simulate(model, time, voltage).displacement + 1e-6 * seed + white
-    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
+    x = psa.simulate(model, time, voltage).displacement + 1e-6 * seed + white
+    return psa.Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
 
 
 def moved(unknowns: Unknowns, seed: int) -> FloatArray:
@@ -119,7 +115,7 @@ def test_missing_samples_are_ignored() -> None:
     assert items[0].model.values["k_L"] != items[2].model.values["k_L"]
 
 
-def fitted(model: Model, experiments: Sequence[Experiment]) -> Fit:
+def fitted(model: psa.Model, experiments: Sequence[Experiment]) -> Fit:
     start = {"k_L": 1.05 * model.values["k_L"], "tau": 1.5 * model.values["tau"]}
     free = free_parameters(model)
     return fit(model, experiments, free, sigma=[SIGMA] * len(experiments), start=start)
@@ -147,17 +143,17 @@ def test_the_parts_of_a_fit_belong_together() -> None:
     assert abs(result.start(0)["f_H"]) < 3.0
 
 
-def _after_a_history(model: Model, peak: float, seed: int) -> Record:
+def _after_a_history(model: psa.Model, peak: float, seed: int) -> psa.Record:
     """A record that starts at 20 V, where the stack has come down to from a peak."""
     time = time_grid(4.0, 2e-3)
     before = time < 2.0
     down = np.interp(time, [0.0, 1.0, 2.0], [0.0, peak, 20.0])
     again = 20.0 + 25.0 * (1.0 - np.cos(2.0 * np.pi * (time - 2.0))) * (time / 4.0)
     voltage = np.where(before, down, again)
-    x = simulate(model, time, voltage).displacement
+    x = psa.simulate(model, time, voltage).displacement
     x = x + SIGMA * np.random.default_rng(seed).standard_normal(time.size)
     t, v, y = (column[~before] for column in (time, voltage, x))
-    return Record(name=f"h{seed}", time=t - t[0], voltage=v, displacement=y)
+    return psa.Record(name=f"h{seed}", time=t - t[0], voltage=v, displacement=y)
 
 
 def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> None:
@@ -232,11 +228,11 @@ def test_a_loop_that_has_left_the_record_far_behind_has_diverged(
 def test_a_fit_without_samples_is_refused() -> None:
     record = record_of(model_with(), 1)
     none = np.zeros(record.n, dtype=np.bool_)
-    with pytest.raises(InputError, match="No sample with a displacement is left to fit"):
+    with pytest.raises(psa.InputError, match="No sample with a displacement is left to fit"):
         fit(model_with(), [Experiment(record, none, none)], ["k_L"], sigma=[SIGMA])
     bare = replace(record, displacement=None)
-    with pytest.raises(InputError, match="No sample with a displacement is left to fit"):
-        fit(compose(BASE), [Experiment(bare, ~none, none)], ["k_L"], sigma=[SIGMA])
+    with pytest.raises(psa.InputError, match="No sample with a displacement is left to fit"):
+        fit(psa.compose(psa.BASE), [Experiment(bare, ~none, none)], ["k_L"], sigma=[SIGMA])
 
 
 def test_a_stack_that_never_settles_leaves_no_start_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -259,12 +255,12 @@ def test_numbers_that_overflow_are_no_simulation(monkeypatch: pytest.MonkeyPatch
 
 def test_fits_of_one_minimum_are_the_same_place_wherever_their_priors_count_from() -> None:
     """The prior of a lag is a factor of e around the model's value, here off by e^7."""
-    model = stack_model("demo")
+    model = psa.stack_model("demo")
     time = time_grid(4e-3, 5e-6)
     voltage = multisine(time, 0.0, 60.0, (500.0, 3e4), seed=3)
-    x = simulate(model, time, voltage, memory={"f_H": 0.0}).displacement
+    x = psa.simulate(model, time, voltage, memory={"f_H": 0.0}).displacement
     noise = 2e-9 * np.random.default_rng(3).standard_normal(time.size)
-    record = Record(name="fast", time=time, voltage=voltage, displacement=x + noise)
+    record = psa.Record(name="fast", time=time, voltage=voltage, displacement=x + noise)
     free, experiments, right = ["k_L", "c_B", "m_B"], [whole(record)], model.values["c_B"]
     off = model.with_values({"c_B": right * np.exp(7.0)})
     near = fit(model, experiments, free, sigma=[2e-9])

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.identification.start.starting_points import (
@@ -14,12 +15,6 @@ from psa_casadi.identification.start.starting_points import (
     excerpts,
     linear_start,
 )
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record
-from psa_casadi.simulation.simulate import simulate
 from tests.identification.paper_cases import transfer
 from tests.studies.benchmarks.records import loop_voltage, multisine_voltage, step_voltage
 from tests.tiers import slow, slow_but
@@ -29,28 +24,30 @@ PAPER = ("PTBS200", "WYDS0808020", "P-885.51")
 
 
 def values_of(name: str) -> dict[str, float]:
-    return {key: figure.value for key, figure in STACKS[name].values.items()}
+    return {key: figure.value for key, figure in psa.STACKS[name].values.items()}
 
 
 def simulated(
     values: Values, time: FloatArray, voltage: FloatArray, effect: str = ""
 ) -> FloatArray:
-    extra = [e for e in EFFECTS.values() if e.name == effect]
+    extra = [e for e in psa.EFFECTS.values() if e.name == effect]
     gain = {str(e.gain): 0.04 for e in extra}
-    model = compose((*BASE, *extra), {**values, **gain})
-    return simulate(model, time, voltage, from_rest_at_zero=True, rtol=1e-7).displacement
+    model = psa.compose((*psa.BASE, *extra), {**values, **gain})
+    return psa.simulate(model, time, voltage, from_rest_at_zero=True, rtol=1e-7).displacement
 
 
-def noisy(name: str, time: FloatArray, voltage: FloatArray, x: FloatArray, share: float) -> Record:
+def noisy(
+    name: str, time: FloatArray, voltage: FloatArray, x: FloatArray, share: float
+) -> psa.Record:
     noise = share * np.ptp(x) * np.random.default_rng(1).standard_normal(x.size)
-    return Record(name=name, time=time, voltage=voltage, displacement=x + noise)
+    return psa.Record(name=name, time=time, voltage=voltage, displacement=x + noise)
 
 
 @cache
-def step_of(name: str, effect: str = "") -> Record:
+def step_of(name: str, effect: str = "") -> psa.Record:
     values = values_of(name)
     time, voltage = step_voltage(values)
-    return Record(
+    return psa.Record(
         name="step",
         time=time,
         voltage=voltage,
@@ -58,7 +55,7 @@ def step_of(name: str, effect: str = "") -> Record:
     )
 
 
-def step(name: str, share: float, effect: str = "") -> Record:
+def step(name: str, share: float, effect: str = "") -> psa.Record:
     clean = step_of(name, effect)
     return noisy("step", clean.time, clean.voltage, np.asarray(clean.displacement), share)
 
@@ -71,7 +68,7 @@ def theta_of(v: Values) -> FloatArray:
     return np.log([*times, v["k_P"] / v["k_B"]])
 
 
-def errors(candidates: Sequence[LinearCandidate], truth: Values, record: Record) -> list[float]:
+def errors(candidates: Sequence[LinearCandidate], truth: Values, record: psa.Record) -> list[float]:
     """Relative L2 error of every candidate's transfer function where the truth is above 1 %."""
     base = starting_model([record]).values
     f = np.geomspace(1.0 / record.duration, 0.25 / record.sample_time, 200)
@@ -83,7 +80,7 @@ def errors(candidates: Sequence[LinearCandidate], truth: Values, record: Record)
     return [float(np.linalg.norm(m) / np.linalg.norm(true[observed])) for m in items]
 
 
-def start(*records: Record) -> tuple[LinearCandidate, ...]:
+def start(*records: psa.Record) -> tuple[LinearCandidate, ...]:
     return linear_start(records, starting_model(records).values)
 
 
@@ -156,7 +153,7 @@ def test_no_size_is_built_in(scale: float) -> None:
     """Times, volts and metres in other units give the same candidates in those units."""
     record = step("WYDS0808020", 1e-3)
     assert record.displacement is not None
-    other = Record(
+    other = psa.Record(
         name="scaled",
         time=scale * record.time,
         voltage=0.1 * record.voltage,
@@ -177,7 +174,7 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
     x = np.array(record.displacement)
     x[np.random.default_rng(0).uniform(size=x.size) < 0.2] = np.nan
     x[300:340] = np.nan
-    other = Record(
+    other = psa.Record(
         name="gaps", time=record.time + 7.0, voltage=record.voltage - 50.0, displacement=3e-5 - x
     )
     assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05

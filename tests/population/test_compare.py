@@ -9,15 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.strict_json import json_text
 from psa_casadi.documents.files import identification_file
-from psa_casadi.documents.findings import read_findings
-from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.model_file import dumps
 from psa_casadi.population.finding import Estimate, Finding, replayed
 from psa_casadi.population.population import population
-from psa_casadi.report.page.devices import MOST, write_comparison, write_population
+from psa_casadi.report.page.devices import MOST
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot
 from psa_casadi.report.words.population_words import missed_sentences, population_sentences
 from tests.model.evidence_models import evident_model
@@ -57,7 +55,7 @@ def test_a_model_and_a_finding_of_the_same_records_are_one_device(tmp_path: Path
         json_text(identification_file(stack_identification)), encoding="utf-8"
     )
     (tmp_path / "model.json").write_text(json.dumps(content), encoding="utf-8")
-    (joined,) = read_findings([tmp_path / "model.json", tmp_path / "a.json"])
+    (joined,) = psa.read_findings([tmp_path / "model.json", tmp_path / "a.json"])
     assert joined.device == "a"
     assert joined.kind == "identification"
     assert joined.trace is not None
@@ -65,8 +63,8 @@ def test_a_model_and_a_finding_of_the_same_records_are_one_device(tmp_path: Path
 
 def test_what_a_record_is_compared_with_has_the_sensors_errors() -> None:
     plain = evident_model()
-    bent = plain.with_effect(EFFECTS["sensor_nonlinearity"])
-    gain = EFFECTS["sensor_nonlinearity"].gain or ""
+    bent = plain.with_effect(psa.EFFECTS["sensor_nonlinearity"])
+    gain = psa.EFFECTS["sensor_nonlinearity"].gain or ""
     far = replace(bent, values={**bent.values, gain: 0.05})
     items = [replayed(m) for m in (plain, bent, far)]
     a, b, c = (np.array(t.model) for t in items if t is not None)
@@ -76,7 +74,7 @@ def test_what_a_record_is_compared_with_has_the_sensors_errors() -> None:
 
 def test_names_are_text_and_plots_have_no_markup(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    write_comparison([finding(HOSTILE, 7.0), finding("b", 7.4)], page)
+    psa.write_comparison([finding(HOSTILE, 7.0), finding("b", 7.4)], page)
     text = page.read_text(encoding="utf-8")
     assert Page(text).loaded == []
     assert HOSTILE in Page(text).text
@@ -87,8 +85,8 @@ def test_names_are_text_and_plots_have_no_markup(tmp_path: Path) -> None:
 
 
 def test_a_page_has_not_too_many_devices(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no room side by side"):
-        write_comparison([finding(f"d{k}", 7.0) for k in range(MOST + 1)], tmp_path / "p.html")
+    with pytest.raises(psa.InputError, match="no room side by side"):
+        psa.write_comparison([finding(f"d{k}", 7.0) for k in range(MOST + 1)], tmp_path / "p.html")
 
 
 @pytest.mark.parametrize(
@@ -102,8 +100,8 @@ def test_a_page_has_not_too_many_devices(tmp_path: Path) -> None:
 def test_files_that_are_none_are_told(content: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(content)
-    with pytest.raises(InputError, match=message):
-        read_findings([path])
+    with pytest.raises(psa.InputError, match=message):
+        psa.read_findings([path])
 
 
 @pytest.mark.parametrize(
@@ -117,8 +115,8 @@ def test_values_that_do_not_belong_are_told_with_their_place(
     (content["errors"] if place.startswith("noise_floor") else content)[place] = value
     path = tmp_path / "x.json"
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match=rf"{place}[^;]*is .*; give "):
-        read_findings([path])
+    with pytest.raises(psa.InputError, match=rf"{place}[^;]*is .*; give "):
+        psa.read_findings([path])
 
 
 def devices() -> list[Finding]:
@@ -144,7 +142,7 @@ def test_a_population_says_who_stands_out_and_which_batch(tmp_path: Path) -> Non
     assert result.batches_differ == ("k_L",)
     assert result.drifting == ("k_L",)
     page = tmp_path / "population.html"
-    write_population(result, page, without=[(HOSTILE, "refused", "line 2 <script>")])
+    psa.write_population(result, page, without=[(HOSTILE, "refused", "line 2 <script>")])
     displayed = Page(page.read_text(encoding="utf-8"))
     assert displayed.loaded == []
     assert "1 of 40 devices stands out: d5. Batches differ in k_L. Over the date, k_L drifts." in (
@@ -195,9 +193,9 @@ def test_the_pages_in_a_browser(
     browser: Browser = find_browser(tmp_path_factory.mktemp("browser"))
     page = tmp_path / f"{name}.html"
     if name == "comparison":
-        write_comparison(read_findings(files)[:1] + tuple(devices()[:2]), page)
+        psa.write_comparison(psa.read_findings(files)[:1] + tuple(devices()[:2]), page)
     else:
-        write_population(population(devices()), page)
+        psa.write_population(population(devices()), page)
     document, console = browser.document(page, "--window-size=1280,900")
     assert console == []
     for box in document.split('class="drawing')[1:]:

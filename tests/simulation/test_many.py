@@ -6,14 +6,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from psa_casadi.common.errors import InputError, MachineError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records.record import Record
 from psa_casadi.simulation import device
-from psa_casadi.simulation.many import simulate_many
 from psa_casadi.simulation.simulate import record_inputs
 from psa_casadi.simulation.start import start_on, starts_on
 from tests.model.stack_models import stack
@@ -22,17 +17,17 @@ from tests.simulation.exact_cases import KINK
 from tests.tiers import slow
 
 
-def record(uneven: bool = False) -> Record:
+def record(uneven: bool = False) -> psa.Record:
     """Return two cycles, a ramp and a hold; with other time steps throughout if `uneven`."""
     t: FloatArray = np.arange(600, dtype=np.float64) * 2e-4
     if uneven:
         t = t + 1e-5 * np.random.default_rng(1).standard_normal(600)
     s = np.arange(600) / 600
     v = np.where(s < 0.6, 40.0 * (1.0 - np.cos(2 * np.pi * s / 0.3)), np.minimum(400 * s - 240, 80))
-    return Record(name="sets", time=t, voltage=np.asarray(v, dtype=np.float64))
+    return psa.Record(name="sets", time=t, voltage=np.asarray(v, dtype=np.float64))
 
 
-def sets(model: Model, count: int) -> list[dict[str, float]]:
+def sets(model: psa.Model, count: int) -> list[dict[str, float]]:
     rng = np.random.default_rng(3)
     return [
         {
@@ -51,13 +46,13 @@ def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
     model = stack("P-885.51")
     if effect:
         gains = {"load_stiffness": "load_gain", "rate_dependent_hysteresis": "rate_gain"}
-        model = model.with_effect(EFFECTS[effect], {gains[effect]: 0.02})
+        model = model.with_effect(psa.EFFECTS[effect], {gains[effect]: 0.02})
     values = sets(model, 9)
-    together = simulate_many(model, values, record())
+    together = psa.simulate_many(model, values, record())
     assert together.shape == (9, 600)
     for k in (0, 3, 4, 8):
-        assert np.array_equal(simulate_many(model, [values[k]], record())[0], together[k])
-    assert np.array_equal(simulate_many(model, values[::-1], record()), together[::-1])
+        assert np.array_equal(psa.simulate_many(model, [values[k]], record())[0], together[k])
+    assert np.array_equal(psa.simulate_many(model, values[::-1], record()), together[::-1])
 
 
 def test_what_is_kept_of_each_set() -> None:
@@ -65,9 +60,9 @@ def test_what_is_kept_of_each_set() -> None:
     model = stack("P-885.51")
     values = sets(model, 5)
     for one in (record(), record(uneven=True)):
-        rows = simulate_many(model, values, one)
-        ranges = simulate_many(model, values, one, reduce=np.ptp)
-        thinned = simulate_many(model, values, one, reduce=lambda row: row[::100])
+        rows = psa.simulate_many(model, values, one)
+        ranges = psa.simulate_many(model, values, one, reduce=np.ptp)
+        thinned = psa.simulate_many(model, values, one, reduce=lambda row: row[::100])
         assert np.array_equal(ranges, np.ptp(rows, axis=1))
         assert np.array_equal(thinned, rows[:, ::100])
 
@@ -76,16 +71,16 @@ def test_sets_by_the_names_of_parameters() -> None:
     model = stack("P-885.51")
     inputs = sets(model, 5)
     columns = {name: [values[name] for values in inputs] for name in inputs[0]}
-    rows = simulate_many(model, inputs, record())
-    assert np.array_equal(simulate_many(model, columns, record()), rows)
-    with pytest.raises(InputError, match=r"in arrays of one length; .*k_L \(5,\), n \(1,\)"):
-        simulate_many(model, {"k_L": columns["k_L"], "n": 1.5}, record())
-    with pytest.raises(InputError, match="there are: none"):
-        simulate_many(model, {}, record())
-    with pytest.raises(InputError, match="no parameter 'stiffness'"):
-        simulate_many(model, {"stiffness": [1.0]}, record())
-    with pytest.raises(InputError, match="outside its bounds"):
-        simulate_many(model, {"n": [1.5, -1.0]}, record())
+    rows = psa.simulate_many(model, inputs, record())
+    assert np.array_equal(psa.simulate_many(model, columns, record()), rows)
+    with pytest.raises(psa.InputError, match=r"in arrays of one length; .*k_L \(5,\), n \(1,\)"):
+        psa.simulate_many(model, {"k_L": columns["k_L"], "n": 1.5}, record())
+    with pytest.raises(psa.InputError, match="there are: none"):
+        psa.simulate_many(model, {}, record())
+    with pytest.raises(psa.InputError, match="no parameter 'stiffness'"):
+        psa.simulate_many(model, {"stiffness": [1.0]}, record())
+    with pytest.raises(psa.InputError, match="outside its bounds"):
+        psa.simulate_many(model, {"n": [1.5, -1.0]}, record())
 
 
 #: Memory in which some of nine sets' displacements fit at a time.
@@ -105,19 +100,19 @@ def test_the_kernel_has_the_bits_of_the_lanes(host: HostCuda) -> None:
     """
     model, one = stack("P-885.51"), record()
     values = sets(model, 9)
-    rows = simulate_many(model, values, one)
-    np.testing.assert_array_equal(simulate_many(model, values, one, device="cuda"), rows)
+    rows = psa.simulate_many(model, values, one)
+    np.testing.assert_array_equal(psa.simulate_many(model, values, one, device="cuda"), rows)
     assert host.launches[1:] == [128, 128]  # behind the question for the size of a room
     for name in ("range", "peak", "last"):
-        ours = simulate_many(model, values, one, reduce=name, device="cuda")
-        np.testing.assert_array_equal(ours, simulate_many(model, values, one, reduce=name))
-    ours = simulate_many(model, values, one, reduce=lambda row: row[::100], device="cuda")
+        ours = psa.simulate_many(model, values, one, reduce=name, device="cuda")
+        np.testing.assert_array_equal(ours, psa.simulate_many(model, values, one, reduce=name))
+    ours = psa.simulate_many(model, values, one, reduce=lambda row: row[::100], device="cuda")
     np.testing.assert_array_equal(ours, rows[:, ::100])
     measured = replace(one, displacement=rows[3])
-    apart = simulate_many(model, values, measured, reduce="misfit", device="cuda")
+    apart = psa.simulate_many(model, values, measured, reduce="misfit", device="cuda")
     np.testing.assert_allclose(apart, np.sqrt(np.mean((rows - rows[3]) ** 2, axis=1)), rtol=1e-13)
     np.testing.assert_allclose(
-        apart, simulate_many(model, values, measured, reduce="misfit"), rtol=1e-13
+        apart, psa.simulate_many(model, values, measured, reduce="misfit"), rtol=1e-13
     )
     assert apart[3] == 0.0
 
@@ -126,12 +121,12 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
     model = stack("PTBS200")
     lost = {"A": -5.0, "beta": -4000.0, "gamma": 0.0, "n": 3.0}
     values: list[dict[str, float]] = [{}, lost, {"k_L": 1.1 * model.values["k_L"]}]
-    rows = simulate_many(model, values, record())
+    rows = psa.simulate_many(model, values, record())
     assert np.isnan(rows[1, -1])
     assert np.isfinite(rows[[0, 2]]).all()
-    assert np.array_equal(rows[[0, 2]], simulate_many(model, values[::2], record()))
-    np.testing.assert_array_equal(simulate_many(model, values, record(), device="cuda"), rows)
-    ranges = simulate_many(model, values, record(), reduce="range", device="cuda")
+    assert np.array_equal(rows[[0, 2]], psa.simulate_many(model, values[::2], record()))
+    np.testing.assert_array_equal(psa.simulate_many(model, values, record(), device="cuda"), rows)
+    ranges = psa.simulate_many(model, values, record(), reduce="range", device="cuda")
     np.testing.assert_array_equal(ranges, np.ptp(rows, axis=1))
     assert host.launches
 
@@ -139,19 +134,19 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
 @slow
 def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
     """The matrices' ladder is too large for the memory of a thread."""
-    model = stack("P-885.51").with_effect(EFFECTS["load_stiffness"], {"load_gain": 0.02})
+    model = stack("P-885.51").with_effect(psa.EFFECTS["load_stiffness"], {"load_gain": 0.02})
     values = sets(model, 3)
-    rows = simulate_many(model, values, record())
-    np.testing.assert_array_equal(simulate_many(model, values, record(), device="cuda"), rows)
+    rows = psa.simulate_many(model, values, record())
+    np.testing.assert_array_equal(psa.simulate_many(model, values, record(), device="cuda"), rows)
     assert host.launches[1:] == [128, 128, 128]  # one fits in the memory
 
 
 @pytest.mark.parametrize("effect", ["slow_creep", "structural_mode"])
 def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
     """Creep has a memory that settles; a gain of zero is not taken out before."""
-    gain = EFFECTS[effect].gain
+    gain = psa.EFFECTS[effect].gain
     assert gain is not None
-    model = stack("P-885.51").with_effect(EFFECTS[effect], {gain: 0.01})
+    model = stack("P-885.51").with_effect(psa.EFFECTS[effect], {gain: 0.01})
     changed = [{**values, gain: 0.0 if k == 3 else 0.01} for k, values in enumerate(sets(model, 9))]
     models = [model.with_values(values) for values in changed]
     t, u = record().time, record_inputs(model, record(), 600)
@@ -166,18 +161,20 @@ def test_starts_of_many_sets_have_the_bits_of_each(effect: str) -> None:
 
 def test_what_a_gpu_cannot_do_is_refused(host: HostCuda) -> None:
     model = stack("P-885.51")
-    with pytest.raises(InputError, match="exact steps fit: the record has 595 different time"):
-        simulate_many(model, [{}], record(uneven=True), device="cuda")
-    with pytest.raises(InputError, match=r"exact steps fit: .* kink of their own"):
-        simulate_many(compose((*BASE, KINK)), [{}], record(), device="cuda")
-    with pytest.raises(InputError, match=r"no device 'tpu'; choose one of \('cpu', 'cuda'\)"):
-        simulate_many(model, [{}], record(), device="tpu")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"no reduction 'mean'; choose one of .*'misfit'"):
-        simulate_many(model, [{}], record(), reduce="mean")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="'misfit' needs the displacement of the record 'sets'"):
-        simulate_many(model, [{}], record(), reduce="misfit")
+    with pytest.raises(psa.InputError, match="exact steps fit: the record has 595 different time"):
+        psa.simulate_many(model, [{}], record(uneven=True), device="cuda")
+    with pytest.raises(psa.InputError, match=r"exact steps fit: .* kink of their own"):
+        psa.simulate_many(psa.compose((*psa.BASE, KINK)), [{}], record(), device="cuda")
+    with pytest.raises(psa.InputError, match=r"no device 'tpu'; choose one of \('cpu', 'cuda'\)"):
+        psa.simulate_many(model, [{}], record(), device="tpu")  # type: ignore[arg-type]
+    with pytest.raises(psa.InputError, match=r"no reduction 'mean'; choose one of .*'misfit'"):
+        psa.simulate_many(model, [{}], record(), reduce="mean")  # type: ignore[arg-type]
+    with pytest.raises(
+        psa.InputError, match="'misfit' needs the displacement of the record 'sets'"
+    ):
+        psa.simulate_many(model, [{}], record(), reduce="misfit")
     assert not host.launches
-    assert simulate_many(model, [], record(), device="cuda").shape == (0, 600)
+    assert psa.simulate_many(model, [], record(), device="cuda").shape == (0, 600)
 
 
 def test_a_gpu_that_fails_is_an_error(host: HostCuda, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,8 +182,8 @@ def test_a_gpu_that_fails_is_an_error(host: HostCuda, monkeypatch: pytest.Monkey
         raise MemoryError("out of memory allocating 512 bytes")
 
     monkeypatch.setattr(host, "empty", full)
-    with pytest.raises(MachineError, match=r"GPU failed \(out of memory .*nvidia-smi"):
-        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
+    with pytest.raises(psa.MachineError, match=r"GPU failed \(out of memory .*nvidia-smi"):
+        psa.simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
 
 
 @pytest.mark.parametrize(
@@ -205,21 +202,21 @@ def test_a_missing_gpu_is_an_error(
     monkeypatch: pytest.MonkeyPatch, cupy: dict[str, object], message: str
 ) -> None:
     monkeypatch.setattr(device, "import_module", Mock(**cupy))
-    with pytest.raises(InputError, match=message):
-        simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
+    with pytest.raises(psa.InputError, match=message):
+        psa.simulate_many(stack("P-885.51"), [{}], record(), device="cuda")
 
 
 def test_a_gpu_gives_what_the_processor_gives() -> None:
     """Where there is a GPU: the same equations in double precision, rounded one by one."""
     try:
         device.device_module()
-    except InputError as error:
+    except psa.InputError as error:
         pytest.skip(str(error))
     model = stack("P-885.51")
     inputs = sets(model, 300)
-    rows = simulate_many(model, inputs, record())
+    rows = psa.simulate_many(model, inputs, record())
     size = np.ptp(rows, axis=1)
-    values = simulate_many(model, inputs, record(), device="cuda")
+    values = psa.simulate_many(model, inputs, record(), device="cuda")
     assert np.max(np.abs(values - rows) / size[:, None]) < 1e-9
-    ranges = simulate_many(model, inputs, record(), reduce="range", device="cuda")
+    ranges = psa.simulate_many(model, inputs, record(), reduce="range", device="cuda")
     np.testing.assert_array_equal(ranges, np.ptp(values, axis=1))

@@ -9,17 +9,15 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.compose import Model
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.simulate import EXACT, STEPPER, Traced, Way, trace
 from psa_casadi.simulation.start import start_on
-from psa_casadi.simulation.stepper import run
 from tests.any_model import own_models
 from tests.simulation.exact_cases import composite, inputs, times, with_effect
 
 SAMPLES = 300
 Unknowns = list[str | int]
-Case = tuple[Model, tuple[str, ...], Unknowns, FloatArray, FloatArray, FloatArray]
+Case = tuple[psa.Model, tuple[str, ...], Unknowns, FloatArray, FloatArray, FloatArray]
 
 
 def _motor() -> Case:
@@ -94,7 +92,7 @@ def test_columns_are_differences_of_runs(stepped: bool) -> None:
                 values[unknown] *= 1.0 + 1e-4 * sign
             else:
                 start[unknown] += 1e-2 * sign
-            ends.append(run(model, t, u, start, rtol=1e-11, values=values).y[:, rows])
+            ends.append(psa.run(model, t, u, start, rtol=1e-11, values=values).y[:, rows])
         step = 1e-4 * model.values[unknown] if isinstance(unknown, str) else 1e-2
         assert _off(result[:, :, column], (ends[0] - ends[1]) / (2.0 * step)) < 1e-5, unknown
 
@@ -109,7 +107,7 @@ BY_INPUT = {
 }
 
 
-def _driven_by(force: ca.SX) -> Model:
+def _driven_by(force: ca.SX) -> psa.Model:
     x, v, k = (ca.SX.sym(n) for n in "xvk")
     return psa.ode_model(
         {

@@ -3,13 +3,9 @@
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.component import Component, Equations, Symbols
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.ports import ports_of, with_ports
-from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.simulate import Way, input_samples, trace
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.tangent import answer, course_of, law_of, opened
@@ -19,7 +15,7 @@ _WAY = Way(1e-8, 1e-8)
 
 
 def _both(
-    base: Model, effect: Component, t: FloatArray, u: FloatArray,
+    base: psa.Model, effect: psa.Component, t: FloatArray, u: FloatArray,
     output: str = "measured_displacement", *, step: float = 0.0,
 ) -> tuple[FloatArray, FloatArray, float]:  # fmt: skip
     """Return what an effect adds (n,) along the course and in a simulation, and the error."""
@@ -45,27 +41,27 @@ def _both(
 
 #: Of a current limit the derivative at 0 is 0.
 _LAWS = [
-    e for e in EFFECTS.values()
+    e for e in psa.EFFECTS.values()
     if not (e.inputs or e.needs_column or e.trial_starts or e.name == "current_limit")
-    and law_of(compose([*BASE, e]).structure, e) is not None
+    and law_of(psa.compose([*psa.BASE, e]).structure, e) is not None
 ]  # fmt: skip
 
 
 def _drive() -> tuple[FloatArray, FloatArray]:
     t = np.linspace(0.0, 2.0, 2001)
     swing = np.sin(2 * np.pi * 1.7 * t) + 0.3 * np.sin(2 * np.pi * 11.0 * t)
-    return t, input_samples(compose(BASE), t.size, {"voltage": 50.0 + 30.0 * swing})
+    return t, input_samples(psa.compose(psa.BASE), t.size, {"voltage": 50.0 + 30.0 * swing})
 
 
-def _shown(model: Model, t: FloatArray, u: FloatArray) -> FloatArray:
+def _shown(model: psa.Model, t: FloatArray, u: FloatArray) -> FloatArray:
     x0 = start_for(model, t, u, {}).x
     return trace(model, t, u, x0, way=_WAY, outputs=["measured_displacement"]).y[:, 0]
 
 
 @pytest.mark.parametrize("effect", _LAWS, ids=lambda e: e.name)
-def test_derivatives_along_the_course_are_those_of_the_whole_model(effect: Component) -> None:
+def test_derivatives_along_the_course_are_those_of_the_whole_model(effect: psa.Component) -> None:
     t, u = _drive()
-    added, simulated, error = _both(compose(BASE), effect, t, u)
+    added, simulated, error = _both(psa.compose(psa.BASE), effect, t, u)
     size = np.std(simulated)
     assert size > 0.0
     assert np.std(added - simulated) < max(4e-3, error) * size
@@ -82,8 +78,8 @@ def test_most_effects_of_the_table_need_no_simulation_of_their_own() -> None:
 )
 def test_finite_gains_are_those_of_the_whole_model(name: str, size: float) -> None:
     t, u = _drive()
-    added, simulated, error = _both(compose(BASE), EFFECTS[name], t, u, step=size)
-    effect = np.std(simulated - _shown(compose(BASE), t, u))
+    added, simulated, error = _both(psa.compose(psa.BASE), psa.EFFECTS[name], t, u, step=size)
+    effect = np.std(simulated - _shown(psa.compose(psa.BASE), t, u))
     assert np.std(added - simulated) < max(5e-3, error) * effect
 
 
@@ -91,9 +87,9 @@ def test_steps_that_the_samples_do_not_show_raise_the_error() -> None:
     """Self-heating by the voltage's way within a sample, and a lag of a millisecond."""
     t = np.linspace(0.0, 2.0, 201)
     steps = 50.0 + 30.0 * np.sign(np.sin(2 * np.pi * 3.0 * t))
-    u = input_samples(compose(BASE), t.size, {"voltage": steps})
+    u = input_samples(psa.compose(psa.BASE), t.size, {"voltage": steps})
     for name in ("self_heating", "drive_lag"):
-        *_, error = _both(compose(BASE), EFFECTS[name], t, u)
+        *_, error = _both(psa.compose(psa.BASE), psa.EFFECTS[name], t, u)
         assert error > 0.1
 
 
@@ -103,21 +99,21 @@ def test_an_effect_with_states_at_two_ports_of_any_model() -> None:
     rate = next(p for b, p in names.items() if b.startswith("rate_"))
     output = next(p for b, p in names.items() if b.startswith("shown_"))
 
-    def equations(s: Symbols) -> Equations:
+    def equations(s: psa.Symbols) -> psa.Equations:
         x = getattr(s, model.state_names[0])
-        return Equations(
+        return psa.Equations(
             der={"warmth": x**2 - s.warmth / s.cooling},
             add={rate.balance: -s.softening * s.warmth * x, output.balance: s.softening * s.warmth},
         )
 
-    effect = Component(
+    effect = psa.Component(
         name="softening", description="it softens with what it has moved", source="a test",
         equations=equations, gain="softening",
         parameters=(
-            Parameter("softening", 0.0, "1", (-1e3, 1e3), "size", scale=1.0),
-            Parameter("cooling", 0.7, "s", (1e-3, 1e3), "time"),
+            psa.Parameter("softening", 0.0, "1", (-1e3, 1e3), "size", scale=1.0),
+            psa.Parameter("cooling", 0.7, "s", (1e-3, 1e3), "time"),
         ),
-        states=(State("warmth", "1", "what it remembers", 1.0),),
+        states=(psa.State("warmth", "1", "what it remembers", 1.0),),
     )  # fmt: skip
     t = np.linspace(0.0, 6.0, 3001)
     u = np.stack([np.sin(3.0 * t + k) for k in range(len(model.input_names))], axis=1)
