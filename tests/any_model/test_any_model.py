@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import iv
 
 import psa_casadi as psa
 from build_scripts import effects_page
@@ -19,7 +20,7 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic.attached import extended
 from psa_casadi.diagnosis.generic.of_rates import effects_of
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
-from psa_casadi.examples import several_motors
+from psa_casadi.examples import motor_pack, several_motors
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
@@ -412,3 +413,33 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
             leave_out=["zero_off"],
             starts=1,
         )
+
+
+@pytest.mark.slow
+def test_effects_of_a_pack_are_named_in_plants_of_other_forms(tmp_path: Path) -> None:
+    """The program of the example: each cause hidden once, and one record without any."""
+    table = motor_pack.main(tmp_path)
+    clean = table.pop("nothing")
+    assert clean.verdict == "adequate"
+    assert not clean.causes
+    for hidden, d in table.items():
+        assert [c.effect for c in d.causes] == [hidden]
+        assert d.causes[0].confidence > 0.95
+        assert d.explained_share is not None
+        assert d.explained_share > 0.95
+        for error in d.errors:
+            assert error.extended < 0.65 * error.base or error.extended < 1.1 * error.noise
+    assert table["winding_heat"].verdict == "cause_named"
+
+    pull = table["cogging"].model.values
+    first = 0.012 * np.exp(-0.5) * 2.0 * iv(1, 0.5) / 0.5  # of the plant's Fourier series
+    assert pull["cogging_torque"] == pytest.approx(first, rel=0.1)
+    assert pull["cogging_phase"] == pytest.approx(np.pi - 0.7, abs=0.1)
+    ripple = table["commutation_ripple"].model.values
+    half = np.pi / 10.0
+    assert ripple["k"] == pytest.approx(0.05 * np.sin(half) / half, rel=1e-3)
+    assert 0.0202 < ripple["ripple"] < 0.0249  # the first wave, and half of the swing
+    assert ripple["ripple_phase"] == pytest.approx(np.pi - 1.0, abs=0.05)
+    heat = table["winding_heat"].model.values
+    assert heat["heat_time"] == pytest.approx(15.0, rel=0.1)
+    assert heat["heating"] * heat["R"] == pytest.approx(0.039 * 1.2, rel=0.2)

@@ -1,4 +1,4 @@
-"""Starting values of the linear part: against truths that the search never sees."""
+"""Starting values: of the linear part, of the hysteresis, and the linear response behind them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -6,17 +6,37 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.signal import lsim
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.identification.start.ordinary import starting_model
+from psa_casadi.identification.fitting.unknowns import static_compliance
+from psa_casadi.identification.start.linear_response import (
+    Response,
+    mechanics_poles,
+    numerator_time,
+    plays,
+    respond,
+    vector_fit,
+)
+from psa_casadi.identification.start.ordinary import loop_start, starting_model
 from psa_casadi.identification.start.starting_points import (
     LinearCandidate,
+    arrangements,
     excerpts,
     linear_start,
 )
+from psa_casadi.model.stacks import STACKS
+from psa_casadi.records import Record
 from tests.identification.paper_cases import transfer
-from tests.studies.benchmarks.records import loop_voltage, multisine_voltage, step_voltage
+from tests.studies.benchmarks.coverage import quantities
+from tests.studies.benchmarks.records import (
+    clean_loops,
+    loop_voltage,
+    multisine_voltage,
+    step_voltage,
+    with_noise,
+)
 from tests.tiers import slow, slow_but
 
 Values = Mapping[str, float]
@@ -255,3 +275,124 @@ def random_stack(rng: np.random.Generator) -> dict[str, float]:
     values["tau"] = max(between(0.1, 10.0) / slow, 1e-7)
     values["R_s"] = between(0.05, 5.0) / (slow * values["C_p"])
     return values
+
+
+BENDS = ("beta", "gamma", "delta")
+
+
+def truth(name: str) -> dict[str, float]:
+    return {key: figure.value for key, figure in STACKS[name].values.items()}
+
+
+@cache
+def loops(name: str) -> list[Record]:
+    return clean_loops(truth(name))
+
+
+def loop_errors(name: str, records: list[Record]) -> dict[str, float]:
+    """Return errors of what the loops show: k, A and the bends over k + A, n as it is."""
+    p = truth(name)
+    model = starting_model(records, p["k_B"])
+    values = loop_start(model, records)
+    assert values is not None
+    size = static_compliance(p) * p["h_ref"]
+    true, value = quantities(p, size), quantities({**model.values, **values}, size)
+    over = true["k_L"] + true["A"]
+    shares = {n: (value[n] - true[n]) / over for n in ("k_L", "A", *BENDS)}
+    return {**shares, "n": value["n"] - true["n"]}
+
+
+@pytest.mark.parametrize("name", slow_but(["P-885.51"], STACKS))
+def test_loops_with_noise_tell_the_hysteresis(name: str) -> None:
+    result = loop_errors(name, with_noise(loops(name), 1e-3, seed=2))
+    assert all(abs(e) < 0.03 for e in result.values()), result
+
+
+def test_noise_of_one_per_cent_and_missing_samples_still_leave_a_good_start() -> None:
+    """The logarithms of (31) and (34) have no samples left there."""
+    spoiled = []
+    for r in with_noise(loops("P-885.51"), 1e-2, seed=5):
+        y = np.array(r.displacement)
+        y[200:230] = np.nan
+        spoiled.append(replace(r, displacement=y))
+    result = loop_errors("P-885.51", spoiled)
+    assert all(abs(e) < 0.3 for e in result.values()), result
+    assert abs(result["k_L"] + result["A"]) < 0.03
+
+
+@slow
+def test_loops_that_begin_amid_a_period_tell_it_too() -> None:
+    cut = [replace_from(r, 300) for r in with_noise(loops("PTBS200"), 1e-3, seed=1)]
+    result = loop_errors("PTBS200", cut)
+    assert all(abs(e) < 0.1 for e in result.values()), result
+
+
+def replace_from(r: Record, first: int) -> Record:
+    y = np.array(r.displacement)
+    return Record(
+        name=r.name, time=r.time[first:], voltage=r.voltage[first:], displacement=y[first:]
+    )
+
+
+def test_nothing_is_read_where_nothing_turns_or_moves() -> None:
+    p = truth("P-885.51")
+    t, v = step_voltage(p)
+    step = Record(name="step", time=t, voltage=v, displacement=1e-7 * v)
+    assert loop_start(starting_model([step]), [step]) is None
+    still = replace_from(loops("P-885.51")[0], 0)
+    still = replace(still, displacement=np.full(still.n, 1e-6))
+    assert loop_start(starting_model(loops("P-885.51")), [still]) is None
+
+
+def test_the_response_is_exact_between_samples() -> None:
+    theta = np.log([1e-5, 3e-5, 2e-7, 9e-12, 4e-6, 6e-11, 4.0])
+    poles, b, h = np.append(mechanics_poles(theta), -1e5), numerator_time(theta), 1e-6
+    x = np.concatenate([[0.0], np.cumsum(np.random.default_rng(1).standard_normal(2000))])
+    gain = np.real(np.prod(-poles)) * b
+    _, exact, _ = lsim(([-1.0 / b], poles, gain), x, h * np.arange(x.size))
+    assert np.max(np.abs(respond(poles, b, x, h) - exact)) < 1e-9 * np.ptp(exact)
+    f = np.geomspace(1e2, 1e6, 20)
+    s = 2j * np.pi * f[:, None]
+    direct = gain * (s[:, 0] + 1.0 / b) / np.prod(s - poles, axis=1)
+    assert np.allclose(transfer(theta, f), direct, rtol=1e-9)
+
+
+@pytest.mark.parametrize("q", [1e-10, 0.9999999e-10, 1.0000001e-10])
+def test_equal_poles_are_no_singularity(q: float) -> None:
+    """Two critically damped pairs at one place, against pairs a hair apart: the same response."""
+    x, h = np.minimum(np.arange(600) / 3.0, 1.0), 1e-6
+    theta = np.log([2e-5, 4e-5, 2e-5, q, 2e-5, q, 5.0])
+    apart = np.log([2e-5, 4e-5, 2.2e-5, 1e-10, 2e-5, 0.9e-10, 5.0])
+    result, near = (respond(mechanics_poles(t), numerator_time(t), x, h) for t in (theta, apart))
+    assert result[-1] == pytest.approx(1.0, abs=1e-4)
+    assert np.max(np.abs(result - near)) < 0.05
+
+
+def test_play_operators_follow_their_recursion() -> None:
+    u = np.cumsum(np.random.default_rng(3).standard_normal(777))
+    radii = np.array([0.5, 3.0, 20.0])
+    state = np.full(3, u[0])
+    for value, result in zip(u, plays(u, radii), strict=True):
+        state = np.minimum(np.maximum(state, value - radii), value + radii)
+        assert np.array_equal(result, state)
+
+
+def test_vector_fitting_finds_the_poles() -> None:
+    theta, h = np.log([1e-7, 5e-5, 1e-7, 1e-14, 6e-6, 6e-11, 5.0]), 1e-6
+    w = np.where(np.arange(1500) < 10, 0.0, 1e-5)
+    y = respond(mechanics_poles(theta), numerator_time(theta), w, h)
+    y += 1e-8 * np.random.default_rng(0).standard_normal(w.size)
+    poles = vector_fit([Response(h, w, y, np.ones(w.size, dtype=bool), 1e-8)], 3)
+    tone = poles[poles.imag > 0][0]
+    assert abs(tone) == pytest.approx(6e-11**-0.5, rel=0.01)
+    assert -2.0 * tone.real / abs(tone) ** 2 == pytest.approx(6e-6, rel=0.1)
+    assert poles[poles.imag == 0][0].real == pytest.approx(-2e4, rel=0.02)
+
+
+def test_every_arrangement_holds_the_poles_it_is_given() -> None:
+    inputs = np.array([-1e3, -8e3, -2e3 + 3e4j, -2e3 - 3e4j])
+    for theta in arrangements(inputs, 1e-6):
+        placed = np.append(mechanics_poles(theta), -np.exp(-theta[0]))
+        for pole in inputs:
+            assert np.min(np.abs(placed - pole)) < 1e-6 * abs(pole)
+    assert len(arrangements(inputs, 1e-6)) > 2

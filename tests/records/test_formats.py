@@ -21,8 +21,7 @@ from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns
 from tests.records import laboratory_bytes
 from tests.records.laboratory_bytes import hdf5, parquet, tdms
-from tests.records.reading_here import here
-from tests.records.record_files import HEADER, ROWS, assert_is, kept, problems_of, write
+from tests.records.record_files import HEADER, ROWS, assert_is, here, kept, problems_of, write
 
 N = 24
 T = np.arange(N) / 8.0

@@ -13,9 +13,8 @@ from scipy.io import savemat
 from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from tests.records.laboratory_bytes import Cell, hdf5, mat, npz, parquet, tdms, xlsx
-from tests.records.reading_here import here
 from tests.records.record_files import HEADER as HEAD
-from tests.records.record_files import assert_is, kept, offered, refused, text
+from tests.records.record_files import assert_is, here, kept, offered, refused, text
 from tests.tiers import slow_but
 
 N = 40

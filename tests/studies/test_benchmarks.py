@@ -16,7 +16,7 @@ from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
-from tests.datasets.test_datasets_one_axis import N as PERIOD
+from tests.datasets.test_datasets import N as PERIOD
 from tests.studies.__main__ import app
 from tests.studies.benchmarks import changed, floors, mirror, names, peers, sampling
 from tests.studies.benchmarks import diagnose as study
