@@ -49,7 +49,7 @@ def described(text: str, name: str = "odd_gain") -> psa.Model:
 
 
 @pytest.mark.parametrize("character", BARRED, ids=ascii)
-def test_what_no_document_can_carry_is_told(character: str) -> None:
+def test_what_no_document_can_carry_is_reported(character: str) -> None:
     with pytest.raises(psa.InputError) as caught:
         check_text(f"{'b' * 100}x{character}y", "The page")
     (problem,) = caught.value.problems

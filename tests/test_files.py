@@ -48,7 +48,7 @@ def test_mode_of_an_old_file_and_the_target_of_a_link_are_kept(tmp_path: Path) -
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
 
-def test_a_new_file_is_readable_as_the_umask_says(tmp_path: Path) -> None:
+def test_a_new_file_is_readable_by_the_umask(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     atomic_write(tmp_path / "ours", "")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
@@ -82,7 +82,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         atomic_write(tmp_path / "file" / "below", "")
 
 
-def test_an_input_error_says_one_problem_on_each_line() -> None:
+def test_an_input_error_states_one_problem_on_each_line() -> None:
     error = InputError(["first.", "second."])
     assert isinstance(error, PsaError)
     assert isinstance(error, ValueError)
@@ -152,7 +152,7 @@ def test_what_a_killed_process_left_goes_and_what_a_live_one_holds_stays(tmp_pat
 
 
 @posix
-def test_a_process_never_sweeps_its_own(tmp_path: Path) -> None:
+def test_a_process_never_sweeps_its_files(tmp_path: Path) -> None:
     with temporary_folder(tmp_path) as folder, temporary_file(tmp_path, "x.fmu") as file:
         assert folder.stat().st_mode & 0o777 == 0o700
         assert file.suffix == ".fmu"

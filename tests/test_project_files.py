@@ -187,7 +187,7 @@ def test_what_is_imported_is_what_is_required() -> None:
 
 
 @pytest.mark.parametrize("extra", FORMATS)
-def test_an_optional_package_is_asked_for_in_a_sentence(extra: str) -> None:
+def test_an_optional_package_is_requested_in_a_sentence(extra: str) -> None:
     names = {r.name.lower() for r in EXTRAS[extra]}
     users = {(path, inside) for path, name, inside in _third_party() if name in names}
     assert users

@@ -135,7 +135,7 @@ def test_results_are_data_frames() -> None:
     assert {"time [s]", "measured_displacement [m]", "f_H [N]"} <= {*table}
 
 
-def test_one_output_is_drawn_on_the_axes_that_are_given() -> None:
+def test_one_output_is_drawn_on_the_axes_that_are_passed() -> None:
     d, matches = diagnosis("cause_named"), identification()
     run, record = psa.simulate(matches.model, T, V), d.experiments[0].record
     axes = Figure().add_subplot()
@@ -381,7 +381,7 @@ def test_another_process_predicts_the_same(tmp_path: Path) -> None:
             np.testing.assert_array_equal(y, driven(model)[0])
 
 
-def test_another_fmu_in_its_place_is_told(tmp_path: Path) -> None:
+def test_another_fmu_in_its_place_is_reported(tmp_path: Path) -> None:
     fmu = psa.export_fmu(psa.part_model("flexure_stage"), tmp_path / "f.fmu")
     kept = pickle.dumps(psa.fmu_model(fmu))
     psa.export_fmu(psa.part_model("prestress_mechanism"), fmu)

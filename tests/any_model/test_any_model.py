@@ -99,7 +99,7 @@ def test_a_model_of_one_state_is_diagnosed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_causes_that_cancel_each_other_are_told() -> None:
+def test_causes_that_cancel_each_other_are_reported() -> None:
     """A heater whose capacity grows with its temperature: no effect of the table does that."""
     rng, t = np.random.default_rng(3), 2.0 * np.arange(700)
     power = np.repeat(rng.uniform(0.0, 120.0, 14), 50)
@@ -138,7 +138,7 @@ _HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
 
 @pytest.mark.slow
 @shares_hysteresis
-def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> None:
+def test_the_hysteresis_of_the_benchmark_is_detected_in_the_restoring_force() -> None:
     d = _hysteresis()
     assert _only(d, "hysteresis_of_x_in_v")
     assert d.causes[0].port == "the rate of v"
@@ -156,7 +156,7 @@ def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> No
 
 @pytest.mark.slow
 @shares_hysteresis
-def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
+def test_the_page_of_a_diagnosis_shows_the_story(tmp_path: Path) -> None:
     d, path = _hysteresis(), tmp_path / "page.html"
     psa.write_report(d, path)
     text = path.read_text("utf-8")
@@ -246,7 +246,7 @@ def test_an_oscillator_is_sampled_and_compared(
 
 
 @pytest.mark.slow
-def test_dry_friction_of_a_motor_is_found_at_its_shaft(
+def test_dry_friction_of_a_motor_is_detected_at_its_shaft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program of the page, whose plant has separate equations."""
@@ -381,7 +381,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
     assert len(items) == text.count("\n| `") == 15
 
 
-def test_the_help_of_both_faces_tells_of_own_models() -> None:
+def test_the_help_of_both_faces_mentions_user_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
         assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
         assert str(face.__doc__).count(word) >= 2  # in the signature and in words

@@ -59,7 +59,7 @@ def test_the_places_of_intermediates() -> None:
 
 
 @pytest.mark.slow
-def test_a_law_that_no_effect_of_the_table_has_is_told_as_a_formula(tmp_path: Path) -> None:
+def test_a_law_that_no_effect_of_the_table_has_is_reported_as_a_formula(tmp_path: Path) -> None:
     model, record, truth = hard.grazing(0)
     without = ("hysteresis", "change", "loss", "curve", "stop", "saturation", "bend", "drag")
     more = ("friction", "delay", "lag", "dead_zone", "drift", "constant")
@@ -128,7 +128,7 @@ def test_a_resistance_over_the_charge_is_named_at_its_parameter() -> None:
     np.testing.assert_allclose(result, [0.05 * 2.2, 0.05 * 1.3], rtol=0.05)
 
 
-def test_an_effect_of_ones_own_acts_at_a_parameter_and_is_kept(tmp_path: object) -> None:
+def test_a_user_effect_acts_at_a_parameter_and_is_kept(tmp_path: object) -> None:
     soft = psa.Component(
         "soft",
         description="the spring softens",

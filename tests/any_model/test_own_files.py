@@ -215,7 +215,7 @@ def test_what_cannot_be_meant_is_refused_with_what_to_type(
     assert re.search(said, _refused(table), re.DOTALL)
 
 
-def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_all_records_are_reported_at_once(tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("time [s],valve,flow,speed\n" + "0,1,2,x\n" * 20)
     statement = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
@@ -227,7 +227,7 @@ def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
     assert "no output of the model 'pump' with eight samples or more; the model's are" in statement
 
 
-def test_a_unit_that_is_not_stated_is_told() -> None:
+def test_a_unit_that_is_not_stated_is_reported() -> None:
     result = psa.identify(motor(), plants.motor(2, friction=0.0), starts=1)
     assert not result.warnings
     record = plants.motor(2, friction=0.0)
@@ -303,7 +303,7 @@ def test_a_clean_record_with_outliers_is_adequate() -> None:
         )
 
 
-def test_identification_and_diagnosis_tell_the_same_noise() -> None:
+def test_identification_and_diagnosis_report_the_same_noise() -> None:
     table = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
     fitted = psa.identify(motor(), table, starts=1)
     matches = psa.diagnose(motor(), table, leave_out=["hysteresis", "stop", "curve", "delay"])
@@ -322,7 +322,7 @@ def test_identification_and_diagnosis_tell_the_same_noise() -> None:
     assert items[0].startswith("w in record has 30 outliers (at ")
 
 
-def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
+def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_reported() -> None:
     record = plants.motor(2, friction=0.0)
     y = np.array(record.columns["w"])
     y[700:760] = y[700]
@@ -355,7 +355,7 @@ _ALL_BUT_LAGS = (
 
 
 @pytest.mark.slow
-def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_told() -> None:
+def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_reported() -> None:
     held = plants.oven(40)
     few = [n for n in _ALL_BUT_LAGS if n != "zero"]
     d = psa.diagnose(oven(), held, known_start=True, leave_out=few)
@@ -404,7 +404,7 @@ def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
         psa.diagnose(motor(), record, leave_out=["lagg"], starts=1)
 
 
-def test_columns_in_another_unit_are_told() -> None:
+def test_columns_in_another_unit_are_reported() -> None:
     record = plants.motor(2, friction=0.0)
     columns = {"voltage": record.columns["voltage"], "w": 9.55e3 * record.columns["w"]}
     result = psa.identify(motor(), {"time": record.time, **columns}, starts=1)

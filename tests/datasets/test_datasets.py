@@ -99,7 +99,7 @@ def test_another_file_than_the_published_one_is_refused(
     assert not list((tmp_path / "cache").rglob("*.csv"))
 
 
-def test_no_network_and_no_such_page_are_told_in_a_sentence(served: str, publish: Publish) -> None:
+def test_no_network_and_no_such_page_are_reported(served: str, publish: Publish) -> None:
     for url in (served.replace("table", "absent"), "http://127.0.0.1:9/table.dat"):
         publish(url, TABLE)
         sentence = r"cannot be downloaded \(\w+\); connect to a network"
@@ -131,7 +131,7 @@ def test_a_folder_is_taken_as_it_is_or_refused(
 
 
 @pytest.mark.parametrize("dataset", DATASETS.values(), ids=lambda d: d.name)
-def test_every_dataset_says_what_it_is(dataset: Dataset) -> None:
+def test_every_dataset_describes_itself(dataset: Dataset) -> None:
     text = datasets.origin_text(dataset)
     for part in (dataset.source, dataset.citation, dataset.licence_text, dataset.description):
         assert len(part) > 20
@@ -198,7 +198,7 @@ def columns(csv: bytes) -> FloatArray:
     return np.array([[float(cell) for cell in row.split(",")] for row in rows])
 
 
-def test_the_linear_response_is_found() -> None:
+def test_the_linear_response_is_recovered() -> None:
     u = voltages(1, 6)
     displayed = linear_response(u, driven(u))
     truth = np.fft.rfft(IMPULSE, n=N, axis=2).transpose(2, 0, 1)
@@ -207,7 +207,7 @@ def test_the_linear_response_is_found() -> None:
 
 
 @pytest.mark.parametrize("axis", range(AXES))
-def test_what_is_left_is_the_answer_to_the_own_voltage(axis: int) -> None:
+def test_what_is_left_is_the_answer_to_the_voltage_of_its_channel(axis: int) -> None:
     u = voltages(1, 6)
     t, v, x = columns(OneAxis(axis, -1, 2, 1, RATE).csv([saved(u), saved(driven(u))])).T
     np.testing.assert_allclose(t, np.arange(N) / RATE, atol=5e-9)
@@ -216,7 +216,7 @@ def test_what_is_left_is_the_answer_to_the_own_voltage(axis: int) -> None:
 
 
 @pytest.mark.parametrize("axis", range(AXES))
-def test_a_bend_of_the_own_answer_stays(axis: int) -> None:
+def test_a_bend_of_the_direct_answer_stays(axis: int) -> None:
     u = voltages(1, 6)
     y, item = driven(u), driven(u, axis)[:, axis]
     bend = 0.3e-6 * (item / 1e-6) ** 3

@@ -261,7 +261,7 @@ def test_a_designed_scan_follows_its_path_on_the_independent_reference() -> None
     assert on_reference(invert(scanner(), a_scan()).response.voltage) < 0.02 * plain
 
 
-def test_the_simulator_says_what_the_reference_says() -> None:
+def test_the_simulator_agrees_with_the_reference() -> None:
     values = creeping_displacement(scanner().values, a_scan().time, a_design().voltage)
     assert values == pytest.approx(a_design().response.displacement, abs=1e-4 * a_scan().span)
 
@@ -332,7 +332,7 @@ def test_a_move_obeys_rate_and_current() -> None:
     assert quick_move.residual < 1e-3
 
 
-def test_mistakes_are_told_together(tmp_path: Path) -> None:
+def test_mistakes_are_reported_together(tmp_path: Path) -> None:
     bad = tmp_path / "path.csv"
     bad.write_text("time [s],displacement [um]\n0,0\n1,x\n", encoding="utf-8")
     with pytest.raises(psa.InputError, match="'x'"):
@@ -369,7 +369,7 @@ def test_the_command_writes_voltage_and_page(tmp_path: Path) -> None:
     assert "Inverted input" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
-def test_a_path_beyond_the_voltage_is_followed_to_the_limit_and_says_so() -> None:
+def test_a_path_beyond_the_voltage_is_followed_to_the_limit_and_that_is_reported() -> None:
     """A peak that is cut by 10 %: the remaining error is where the limit is."""
     need = float(invert(scanner(), a_scan()).response.voltage.max())
     limits = AmplifierLimits(max_voltage=0.9 * need)

@@ -146,7 +146,7 @@ def test_no_neighbour_within_the_limits_is_damped_enough_and_wider() -> None:
     assert beaten == 0
 
 
-def test_force_limit_holds_and_an_unreachable_goal_is_said() -> None:
+def test_force_limit_holds_and_an_unreachable_goal_is_reported() -> None:
     d = psa.design_mechanism(
         psa.stack_model(STACK), damping=0.7, limits=Limits(force=300.0), starts=1
     )
@@ -181,7 +181,7 @@ def test_root_locus_runs_from_the_free_stack_to_the_design() -> None:
     assert np.sort_complex(branches[-1]) == pytest.approx(np.sort_complex(d.poles), rel=1e-9)
 
 
-def test_bad_wishes_are_all_told_at_once() -> None:
+def test_bad_wishes_are_all_reported_at_once() -> None:
     with pytest.raises(psa.InputError) as caught:
         psa.design_mechanism(
             psa.stack_model(STACK), damping=1.5, poles=(1.0 + 2.0j,),

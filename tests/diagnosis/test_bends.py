@@ -27,7 +27,7 @@ BENDS = ("load_stiffness", "sensor_nonlinearity")
     ("rate", "free", "alike"),
     [(1e3, ["k_L", "m_B"], (BENDS,)), (2e4, ["k_L"], (BENDS,)), (2e4, ["k_L", "m_B"], ())],
 )
-def test_bends_are_alike_where_no_resonance_shows(
+def test_bends_are_equivalent_where_no_resonance_shows(
     rate: float, free: list[str], alike: tuple[tuple[str, ...], ...]
 ) -> None:
     time = np.arange(200) / rate
@@ -103,7 +103,7 @@ def test_both_plants_are_offered_and_differ_by_the_bend() -> None:
 
 
 @slow
-def test_the_command_writes_the_other_model_beside_the_extended_one(tmp_path: Path) -> None:
+def test_the_command_writes_the_other_model_next_to_the_extended_one(tmp_path: Path) -> None:
     voltage, reading, _ = _reading()
     record, out = tmp_path / "r.csv", tmp_path / "ext.json"
     psa.write_record(

@@ -71,7 +71,7 @@ HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)
-def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> None:
+def test_what_is_hidden_is_detected_at_its_port(hidden: str, clean: FloatArray) -> None:
     y = _measured(clean, HIDDEN[hidden](clean))
     result, experiments, colour = _fitted(y)
     observed = corrections(result, experiments, colour)
@@ -106,7 +106,7 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
     assert model.without([model.effects[-1].name]).effects == ()
 
 
-def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
+def test_resonances_have_no_separate_component(clean: FloatArray) -> None:
     result, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
     modes = [c for c in corrections(result, experiments, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)

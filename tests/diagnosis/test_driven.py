@@ -51,7 +51,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
     assert "does not follow the voltage" in psa.story(result)
 
 
-def test_a_flipped_sign_is_told_with_figures(displacement: FloatArray) -> None:
+def test_a_flipped_sign_is_reported_with_figures(displacement: FloatArray) -> None:
     result = _told(-displacement)
     assert result.verdict == "not_driven"
     assert (
@@ -61,7 +61,7 @@ def test_a_flipped_sign_is_told_with_figures(displacement: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
-def test_a_displacement_in_another_unit_is_told(factor: float, displacement: FloatArray) -> None:
+def test_another_unit_of_displacement_is_reported(factor: float, displacement: FloatArray) -> None:
     result = _told(factor * displacement)
     assert result.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
@@ -81,7 +81,7 @@ def _modes() -> psa.Record:
     return psa.Record(name="r", time=time, voltage=voltage, displacement=y)
 
 
-def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with_it() -> None:
+def test_a_linear_filter_of_the_voltage_is_distinguished_from_what_is_unrelated() -> None:
     modes = _modes()
     noise = np.random.default_rng(4).standard_normal(modes.n)
     shares = [filtered([split(r)]) for r in (modes, replace(modes, displacement=noise))]
@@ -110,7 +110,7 @@ def test_what_no_fit_can_start_from_is_refused_in_words(displacement: FloatArray
 
 
 @slow
-def test_a_record_at_rest_beside_others_counts_over_their_range(displacement: FloatArray) -> None:
+def test_a_record_at_rest_next_to_others_counts_over_their_range(displacement: FloatArray) -> None:
     moves = psa.Record(name="r", time=TIME, voltage=VOLTAGE, displacement=displacement)
     rest = np.ones(TIME.size)
     hold = replace(
@@ -161,7 +161,7 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
     assert np.std(error) < 0.3 * np.std(_curved(clean) - clean)
 
 
-def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
+def test_without_a_correction_nothing_is_written_and_that_is_reported(tmp_path: Path) -> None:
     text = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
     assert "No unnamed correction" in text
     assert not (tmp_path / "p.json").exists()

@@ -64,7 +64,7 @@ def test_noise_is_no_reason_to_doubt(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
+def test_larger_held_out_errors_are_reported_and_stray_readings_are_not(
     fitted: tuple[Fit, FloatArray, FloatArray], seed: int
 ) -> None:
     _, voltage, clean = fitted
@@ -78,7 +78,7 @@ def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 @pytest.mark.parametrize("samples", [200, 1000, SAMPLES])
-def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
+def test_a_held_out_record_with_different_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
 ) -> None:
     """A tenth of it determines its offset; its noise is three times that of the fitted one."""

@@ -29,7 +29,7 @@ from tests.tiers import slow, slow_but
 
 
 @slow
-def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
+def test_the_order_of_the_records_does_not_matter(tmp_path: Path) -> None:
     ends = (1000, 1000)  # their lengths hold no information either
     truth = make_record("offset_drift", 3, tmp_path / "a.csv", excitation="triangle")
     play_again(truth, 4, tmp_path / "b.csv")
@@ -44,7 +44,7 @@ def test_the_order_of_the_records_tells_nothing(tmp_path: Path) -> None:
 
 
 @slow
-def test_an_effect_that_the_bent_base_hides_is_found(tmp_path: Path) -> None:
+def test_an_effect_that_the_bent_base_hides_is_detected(tmp_path: Path) -> None:
     """Four effects lead the screening, none explains the data: an amplifier of 0.9 ms does."""
     path = tmp_path / "record.csv"
     make_record("drive_lag", 52001, path, gain=9.171e-4)
@@ -109,7 +109,7 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
 
 
 @slow
-def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Path) -> None:
+def test_a_tone_at_an_image_of_the_stack_resonance_is_no_cause(tmp_path: Path) -> None:
     """1.69 kHz sampled at 2 kHz, aliased to 0.33 kHz, where it decays as fast in time."""
     make_record(None, 19, tmp_path / "a.csv", excitation="short")
     result = diagnose([read_record(tmp_path / "a.csv")], effects=[EFFECTS["structural_mode"]])
@@ -117,7 +117,7 @@ def test_a_tone_at_an_image_of_the_stacks_own_resonance_is_no_cause(tmp_path: Pa
 
 
 @slow
-def test_a_missed_resonance_is_no_cause(tmp_path: Path) -> None:
+def test_an_undetected_resonance_is_no_cause(tmp_path: Path) -> None:
     """Without a search for its ringing, this clean record has the verdict unexplained."""
     make_record(None, 118254, tmp_path / "a.csv", noise="ar")
     effects = [EFFECTS[n] for n in ("structural_mode", "sensor_delay", "sensor_lag", "drive_lag")]
@@ -149,7 +149,7 @@ def test_quick_fits_integrate_below_the_noise(tmp_path: Path) -> None:
         ("exam/k04", 2, "backlash"),  # so small that no derivative promises it
     ],
 )
-def test_a_cause_is_found_on_another_draw(case: str, draw: int, cause: str, tmp_path: Path) -> None:
+def test_a_cause_is_named_on_another_draw(case: str, draw: int, cause: str, tmp_path: Path) -> None:
     _, path = ASKS[case](tmp_path, draw)
     assert [c.effect for c in psa.diagnose(path).causes] == [cause]
 

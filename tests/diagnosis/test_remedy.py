@@ -60,7 +60,7 @@ def test_play_sets_the_ways_apart_by_the_gap_and_a_delay_moves_by_rate_times_tim
     assert late["slew", RATE].value == pytest.approx(2e-4 * RATE * PER_VOLT, rel=1e-3)
 
 
-def test_a_curve_bends_beside_zero_and_sensitivity() -> None:
+def test_a_curve_bends_next_to_zero_and_sensitivity() -> None:
     gain, rated = 0.1, psa.compose(psa.BASE, VALUES).values["u_rated"]
     result = of("field_dependent_gain", stack("field_dependent_gain", field_gain=gain))
     u = np.linspace(LOW, HIGH, 2001)
@@ -115,7 +115,7 @@ def test_every_effect_has_a_size_and_a_remedy_in_words(effect: psa.Component) ->
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_says_what_now_right_below_itself(tmp_path: Path, verdict: Verdict) -> None:
+def test_every_verdict_is_followed_by_the_next_step(tmp_path: Path, verdict: Verdict) -> None:
     d = diagnosis(verdict)
     advice = what_now(d, "my models/e.json")
     psa.write_report(d, tmp_path / "r.html", still=True, model_file="my models/e.json")

@@ -26,7 +26,7 @@ def noise(correlation: float, seed: int = 4) -> FloatArray:
     return coloured(np.random.default_rng(seed).standard_normal(N), correlation)
 
 
-def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
+def test_white_noise_stays_white_whatever_is_slow_in_it() -> None:
     triangle = 2.0 * np.abs((TIME / 0.15) % 2.0 - 1.0)
     steps = np.sign(np.sin(2.0 * np.pi * 1.4 * TIME))
     tone = np.sin(2.0 * np.pi * 157.0 * TIME)
@@ -108,7 +108,7 @@ def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
     assert result.colour.whiten(result.residuals).std() == pytest.approx(result.level, rel=0.02)
 
 
-def test_slow_waves_are_no_evidence_beside_a_random_walk() -> None:
+def test_slow_waves_are_no_evidence_next_to_a_random_walk() -> None:
     """White noise would speak for them with hundreds of nats."""
     walk = np.cumsum(np.random.default_rng(3).standard_normal(N))
     waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, N), np.arange(8)))

@@ -69,7 +69,7 @@ def test_a_record_that_hides_nearly_all_names_no_cause(
 
 
 @pytest.mark.parametrize("share", [0.12, 0.15, 0.2, 0.5])
-def test_an_end_is_told_however_little_is_shown_below_it(share: float, triangle: Record) -> None:
+def test_an_end_is_reported_with_little_data_below_it(share: float, triangle: Record) -> None:
     record = shown_up_to(triangle, share)
     y = record.displacement
     assert y is not None
@@ -188,7 +188,7 @@ def grid(step: float) -> FloatArray:
     return np.linspace(0.0, (N - 1) * step, N)
 
 
-def test_a_mains_line_between_the_harmonics_of_a_drive_is_told_from_them() -> None:
+def test_a_mains_line_between_the_harmonics_of_a_drive_is_distinguished_from_them() -> None:
     time = np.linspace(0.0, 4.999, 5000)
     triangle, fifth = (
         Record(name="triangle", time=time, voltage=np.arcsin(np.sin(2.0 * np.pi * f * time)))
@@ -233,7 +233,7 @@ def test_what_the_other_parts_lose_is_counted_without_the_one_that_gains_most() 
     assert lost_elsewhere([experiment], [base], [np.ones(N)], 2.0) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_single_slow_triangle_is_said_to_be_blind_to_fast_effects(
+def test_a_slow_triangle_is_blind_to_fast_effects(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     path = tmp_path_factory.mktemp("blind") / "r.csv"
@@ -271,7 +271,7 @@ HELD = [(29.0, 60.0), (40.0, 60.0)]
         ([(0.0, 0.0), (40.0, 100.0)], ["a hold", "three rates", "three amplitudes", "repeats"]),
     ],
 )
-def test_what_is_lacking_is_asked_for_and_nothing_else(
+def test_what_is_lacking_is_requested_and_nothing_else(
     knots: list[tuple[float, float]], lacks: list[str]
 ) -> None:
     statement = str(useful_records([_record(knots)]))

@@ -246,7 +246,7 @@ def _rate(h: float, dq: float) -> float:
 
 
 @pytest.mark.slow
-def test_it_is_named_alone_and_predicts_a_record_that_no_fit_has_seen() -> None:
+def test_it_is_named_alone_and_predicts_a_record_that_no_fit_has_used() -> None:
     fitted = [_leaking("slow", 0.05, 60.0, 50.0, 1), _leaking("fast", 1.0, 10.0, 500.0, 2)]
     slow = ("charge_leakage", "slow_creep", "ageing", "self_heating", "offset_drift", "drive_lag")
     like = [psa.EFFECTS[n] for n in (*slow, "sensor_lag", "hysteresis_memory")]

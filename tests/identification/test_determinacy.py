@@ -101,7 +101,7 @@ def test_what_follows_from_the_form_is_true() -> None:
         np.testing.assert_allclose(same, x, rtol=0, atol=2e-6 * np.ptp(x))
 
 
-def test_a_given_stiffness_ends_the_freedom_of_scale() -> None:
+def test_a_known_stiffness_ends_the_freedom_of_scale() -> None:
     matches, _, determined = loops("P-885.51")
     result = free_combinations(matches.model, determined, force_scale_given=True)
     assert not any("scale of force" in c.sentence for c in result)
@@ -226,7 +226,7 @@ def test_following_the_advice_determines_what_it_promises(name: str) -> None:
             assert error < 0.5 * determined.standard_errors[n]
 
 
-def test_what_no_record_can_tell_is_said() -> None:
+def test_what_no_record_can_determine_is_reported() -> None:
     """Only the product of resistance and capacitance acts on a displacement."""
     model = stack("P-885.51")
     time, voltage = loop_voltage(model.values, 1.0, 1.0)

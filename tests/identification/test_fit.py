@@ -160,7 +160,7 @@ def _after_a_history(model: psa.Model, peak: float, seed: int) -> psa.Record:
     return psa.Record(name=f"h{seed}", time=t - t[0], voltage=v, displacement=y)
 
 
-def test_a_record_that_is_held_out_begins_as_the_others_of_its_device_do() -> None:
+def test_a_record_that_is_held_out_starts_as_the_others_of_its_device_do() -> None:
     """Also where its first tenth gives another memory, by an error that the model has there."""
     model = model_with()
     records = [_after_a_history(model, 90.0, seed) for seed in (1, 2, 3)]
@@ -304,7 +304,7 @@ def allowed(experiment: Experiment, sigma: float) -> float:
     return max(0.03 * sigma, 1e-6 * float(np.ptp(measured(experiment.record)[experiment.used])))
 
 
-def test_a_fit_tells_way_and_error_of_each_record() -> None:
+def test_a_fit_reports_way_and_error_of_each_record() -> None:
     experiments = [whole(regular()), whole(jittered(SIGMA, 2))]
     result = fitted_demo(experiments, SIGMA)
     assert [s.way for s in result.simulated] == [EXACT, STEPPER]
@@ -314,7 +314,7 @@ def test_a_fit_tells_way_and_error_of_each_record() -> None:
     assert result.rms == pytest.approx(SIGMA, rel=0.15)
 
 
-def test_the_error_that_is_told_is_that_against_the_stepper() -> None:
+def test_the_reported_error_is_that_against_the_stepper() -> None:
     """An estimate by a finer run: right within a factor, unless it is far below what counts."""
     experiments = [whole(regular())]
     result = fitted_demo(experiments, SIGMA)

@@ -136,7 +136,7 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
 
-def test_a_turned_sign_is_told() -> None:
+def test_a_turned_sign_is_reported() -> None:
     r = plants.plain(1).record(1, "charge", samples=400)
     turned = replace(r, charge=-np.asarray(r.charge))
     for record, output in ((r, False), (turned, True)):
@@ -189,7 +189,7 @@ def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> Non
 
 
 @slow
-def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
+def test_a_second_sensor_distinguishes_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
     right = "sensor_nonlinearity"
     result = diagnosed(plants.bent_sensor, 0.03, "displacement_2", BENDS)
     assert [c.effect for c in result.causes] == [right]
@@ -210,7 +210,7 @@ def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path)
 
 
 @slow
-def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
+def test_a_load_cell_distinguishes_a_bent_sensor_from_a_stiffening_load() -> None:
     """The measured load is an input; a load that stiffens is in the column then."""
     bent = diagnosed(plants.bent_sensor, 0.03, "load_force", BENDS)
     assert [c.effect for c in bent.causes] == ["sensor_nonlinearity"]
@@ -234,7 +234,7 @@ def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
         (plants.saturating_stack, "saturation_of_strain", "the amplifier"),
     ],
 )
-def test_a_monitor_voltage_tells_the_amplifier_from_the_stack(
+def test_a_monitor_voltage_distinguishes_the_amplifier_from_the_stack(
     hide: Hide, right: str, place: str
 ) -> None:
     result = diagnosed(hide, 0.1, "monitor_voltage", VOLTAGES, "triangle")

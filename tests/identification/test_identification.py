@@ -55,7 +55,7 @@ def test_what_is_not_determined_is_listed(seed: int) -> None:
 
 
 @slow
-def test_a_given_stiffness_scales_the_forces() -> None:
+def test_a_known_stiffness_scales_the_forces() -> None:
     record = plant(2)[1].slice(0, 2500)
     assumed, inputs = psa.identify([record]), psa.identify([record], stiffness=1e7)
     assert assumed.model.provenance.force_scale == "assumed"

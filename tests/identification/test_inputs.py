@@ -55,7 +55,7 @@ def two_clocked(run: Run, beats: float) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("beats", [-4.3, 2.8, 3.6])
-def test_the_saw_tooth_is_found_and_undone(run: Run, beats: float) -> None:
+def test_the_saw_tooth_is_detected_and_undone(run: Run, beats: float) -> None:
     """Period within 1 %, height within 10 %, under noise twice the saw tooth."""
     reading, even = two_clocked(run, beats)
     inputs = record(run, reading, 2.0 * float(np.std(even)))
@@ -70,7 +70,7 @@ def test_the_saw_tooth_is_found_and_undone(run: Run, beats: float) -> None:
     assert there.sha256 != inputs.sha256
 
 
-def test_the_finding_is_told_and_repeats(run: Run) -> None:
+def test_the_finding_is_reported_and_repeats(run: Run) -> None:
     """In the sentences of a fit; the same within 1 % when the data change by 1 % of their noise."""
     reading, even = two_clocked(run, -3.3)
     noise = 2.0 * float(np.std(even))
@@ -153,7 +153,7 @@ def _record(*, smooth: bool) -> tuple[Fit, tuple[Experiment, ...]]:
     return fit(model, experiments, FREE, sigma=[NOISE]), experiments
 
 
-def test_a_smooth_voltage_is_seen_and_straight_lines_get_the_mean_of_its_curve() -> None:
+def test_a_smooth_voltage_is_detected_and_straight_lines_get_the_mean_of_its_curve() -> None:
     result, experiments = _record(smooth=True)
     otherwise = smooth_between(result, experiments)
     assert otherwise is not None
@@ -180,7 +180,7 @@ def test_straight_lines_and_other_errors_are_left_as_they_are() -> None:
 
 
 @pytest.mark.parametrize("stamps", [True, False])
-def test_stamps_that_jitter_are_told_from_samples_that_do(stamps: bool) -> None:
+def test_stamps_that_jitter_are_distinguished_from_samples_that_do(stamps: bool) -> None:
     """A tenth of a step: either the file's times are wrong, or the samples were taken then."""
     random = np.random.default_rng(4)
     even: FloatArray = np.linspace(0.0, INTERVAL * (COUNT - 1), COUNT)

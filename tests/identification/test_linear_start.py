@@ -114,7 +114,7 @@ STEP_ERRORS = [
 @pytest.mark.parametrize(
     ("name", "share", "first"), slow_but([STEP_ERRORS[0], STEP_ERRORS[-1]], STEP_ERRORS)
 )
-def test_a_step_tells_the_transfer_function(name: str, share: float, first: float) -> None:
+def test_a_step_determines_the_transfer_function(name: str, share: float, first: float) -> None:
     record = step(name, share)
     result = start(record)
     misfit = errors(result, values_of(name), record)
@@ -124,7 +124,7 @@ def test_a_step_tells_the_transfer_function(name: str, share: float, first: floa
     assert len(result) <= 4
 
 
-def test_a_ringing_step_tells_the_bonding_layers() -> None:
+def test_a_ringing_step_determines_the_bonding_layers() -> None:
     """Wafers and bonding layers exchanged respond almost equally: both are among the candidates."""
     record, truth = step("PTBS200", 1e-3), values_of("PTBS200")
     result, k_B = start(record), starting_model([record]).values["k_B"]
@@ -138,7 +138,7 @@ def test_a_ringing_step_tells_the_bonding_layers() -> None:
 
 
 @pytest.mark.parametrize("name", slow_but(["PTBS200"], PAPER))
-def test_a_multisine_tells_it_in_spite_of_the_loop(name: str) -> None:
+def test_a_multisine_determines_it_in_spite_of_the_loop(name: str) -> None:
     values = values_of(name)
     time, voltage = multisine_voltage(values, seed=3)
     record = noisy("multisine", time, voltage, simulated(values, time, voltage), 1e-3)
@@ -210,7 +210,7 @@ def test_irregular_samples_are_put_on_a_grid() -> None:
 
 
 @pytest.mark.parametrize("between", [False, True])
-def test_coarse_samples_tell_the_slower_part(between: bool) -> None:
+def test_coarse_samples_determine_the_slower_part(between: bool) -> None:
     """Eight samples a period of the ringing; the jump is a ramp of one sample, or lies in it."""
     values = values_of("PTBS200")
     fine = step_of("PTBS200")
@@ -247,7 +247,7 @@ def test_stacks_of_any_speed(seed: int) -> None:
 
 
 @pytest.mark.parametrize("ratio", slow_but([0.6], [1.0, 0.6]))
-def test_a_zero_in_the_band_tells_the_stiffness_ratio(ratio: float) -> None:
+def test_a_zero_in_the_band_determines_the_stiffness_ratio(ratio: float) -> None:
     """Ringing wafers, overdamped bonding layers: b of eq. (11) is far from both a_P and a_B."""
     values = {**values_of("PTBS200"), "tau": 2e-5, "R_s": 5.0}
     values["k_P"] = ratio * values["k_B"]
@@ -303,7 +303,7 @@ def loop_errors(name: str, records: list[Record]) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], STACKS))
-def test_loops_with_noise_tell_the_hysteresis(name: str) -> None:
+def test_loops_with_noise_determine_the_hysteresis(name: str) -> None:
     result = loop_errors(name, with_noise(loops(name), 1e-3, seed=2))
     assert all(abs(e) < 0.03 for e in result.values()), result
 
@@ -321,7 +321,7 @@ def test_noise_of_one_per_cent_and_missing_samples_still_leave_a_good_start() ->
 
 
 @slow
-def test_loops_that_begin_amid_a_period_tell_it_too() -> None:
+def test_loops_that_start_amid_a_period_determine_it_too() -> None:
     cut = [replace_from(r, 300) for r in with_noise(loops("PTBS200"), 1e-3, seed=1)]
     result = loop_errors("PTBS200", cut)
     assert all(abs(e) < 0.1 for e in result.values()), result
@@ -389,7 +389,7 @@ def test_vector_fitting_finds_the_poles() -> None:
     assert poles[poles.imag == 0][0].real == pytest.approx(-2e4, rel=0.02)
 
 
-def test_every_arrangement_holds_the_poles_it_is_given() -> None:
+def test_every_arrangement_holds_the_required_poles() -> None:
     inputs = np.array([-1e3, -8e3, -2e3 + 3e4j, -2e3 - 3e4j])
     for theta in arrangements(inputs, 1e-6):
         placed = np.append(mechanics_poles(theta), -np.exp(-theta[0]))

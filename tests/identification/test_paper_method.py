@@ -82,7 +82,7 @@ def test_factors_reproduce_the_coefficients(name: str) -> None:
         assert result[key] == pytest.approx(p[key], rel=1e-4)
 
 
-def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
+def test_a_zero_that_the_poles_do_not_allow_is_reported() -> None:
     p = values("PTBS200")
     named = dict(zip(COEFFICIENTS, coefficients_of_values(p).tolist(), strict=True))
     result, notes = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
@@ -133,7 +133,7 @@ def test_the_whole_method_where_its_assumptions_hold() -> None:
     assert np.sqrt(np.mean(on_loop**2)) < 0.003 * loop().range_m
 
 
-def test_steps_and_loops_are_told_by_their_voltage() -> None:
+def test_steps_and_loops_are_classified_by_their_voltage() -> None:
     time = time_grid(2.0, 1e-3)
     held = np.where(time < 0.5, 10.0, 60.0)
     shapes = {
@@ -222,7 +222,7 @@ def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
 
 
 @slow
-def test_nothing_is_said_against_a_step_that_serves() -> None:
+def test_no_warning_concerns_a_step_that_serves() -> None:
     assert linear_part(find_steps([_quiet(6e-3, 40001)])[0])[1] == []
     paper_identification = paper_method([_quiet(6e-3, 40001), loop()])
     assert not any(

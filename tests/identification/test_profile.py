@@ -124,7 +124,7 @@ def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
     assert "nothing bounds it from below" in sentence
 
 
-def test_a_fit_that_stopped_short_is_told_so() -> None:
+def test_a_fit_that_stopped_short_is_reported() -> None:
     result, experiments = fitted("k_L", "tau")
     theta = result.theta.copy()
     error = determinacy(result, experiments).standard_errors["tau"]

@@ -26,7 +26,7 @@ def truth(name: str) -> dict[str, float]:
 
 
 @slow
-def test_a_stack_is_found_from_its_records_alone() -> None:
+def test_a_stack_is_identified_from_its_records_alone() -> None:
     """Step, loops and multisine of the reference with 0.1 % noise, without a start."""
     run = one_run("PTBS200", 3)
     assert run.converged
@@ -64,7 +64,7 @@ def _response(p: dict[str, float], frequency: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(("part", "other"), ["PB", "BP"])
-def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
+def test_a_slow_pole_next_to_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
     """With a creep lag that cancels the zero, the oscillator's slow pole is all that shows."""
     p = truth("demo")
     p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
@@ -90,7 +90,7 @@ def identification() -> StackIdentification:
     return identify(loops())
 
 
-def test_every_record_has_its_own_noise_level() -> None:
+def test_every_record_has_a_separate_noise_level() -> None:
     quiet, loud = with_noise(loops()[:1], 2e-3, 1)[0], loops()[1]
     result = identify([quiet, loud])
     first, second = (
@@ -101,7 +101,7 @@ def test_every_record_has_its_own_noise_level() -> None:
     assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
-def test_what_loops_leave_open_is_told_in_words(identification: StackIdentification) -> None:
+def test_what_loops_leave_open_is_reported_in_words(identification: StackIdentification) -> None:
     assert identification.fit.converged
     lags = {"tau", "R_s", "c_P", "c_B"}
     assert lags & set(identification.determinacy.undetermined)

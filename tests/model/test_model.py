@@ -146,7 +146,7 @@ def test_other_values_or_physics_have_no_evidence() -> None:
     assert model.with_starts({"u": 1.0}).evidence is model.evidence
 
 
-def test_a_plant_keeps_it_with_the_covariance_of_its_own_parameters() -> None:
+def test_a_plant_keeps_it_with_the_covariance_of_its_parameters() -> None:
     model = evident_model()
     drift = psa.EFFECTS["offset_drift"]
     gain = drift.gain or ""
@@ -198,7 +198,7 @@ def assert_computes_the_same(model: Model, other: Model, rtol: float = 1e-13) ->
 
 @pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("ported", [False, True])
-def test_a_model_of_ones_own_comes_back_exactly(name: str, ported: bool) -> None:
+def test_a_user_model_comes_back_exactly(name: str, ported: bool) -> None:
     model = with_ports(OWN[name]()) if ported else OWN[name]()
     result = again(model)
     assert dict(result.values) == dict(model.values)
@@ -247,7 +247,7 @@ def test_a_connected_system_with_sampled_parts_comes_back() -> None:
     assert_computes_the_same(model, result)
 
 
-def test_own_components_stand_beside_those_of_the_package() -> None:
+def test_user_components_join_those_of_the_package() -> None:
     component = psa.Component(
         "pull", "a spring at the tip", "test", gain="k_pull",
         equations=lambda s: psa.Equations(add={"tip_force": -s.k_pull * s.tip_displacement}),
@@ -357,7 +357,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("case", HOSTILE)
-def test_a_mistake_in_an_own_component_is_named(case: str) -> None:
+def test_a_mistake_in_a_user_component_is_named(case: str) -> None:
     change, problem = HOSTILE[case]
     content = json.loads(dumps(motor()))
     change(content)

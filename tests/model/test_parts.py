@@ -383,7 +383,7 @@ def test_a_connected_model_has_the_equations_of_its_parts() -> None:
             np.testing.assert_allclose(np.array(result).ravel(), wanted, rtol=1e-13)
 
 
-def test_every_mistake_in_the_wires_is_told_at_once() -> None:
+def test_every_mistake_in_the_wires_is_reported_at_once() -> None:
     parts = {"a": _gain("a"), "b": _gain("b"), "c": _gain("c", unit="m")}
     wires = (("a.out", "b.into"), ("b.out", "b.into"), ("c.out", "a.into"), ("a.there", "c.into"),
              ("nowhere.out", "c.into"))  # fmt: skip

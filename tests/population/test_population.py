@@ -83,7 +83,7 @@ def test_tau_is_where_q_is_expected() -> None:
 
 
 @pytest.mark.parametrize("tau", slow_but([1.0], [0.0, 1.0]))
-def test_intervals_cover_and_few_are_told_without_cause(tau: float) -> None:
+def test_intervals_cover_and_few_are_reported_without_cause(tau: float) -> None:
     rng = np.random.default_rng(3)
     rounds, tau_in, mean_in, alarms = 600, 0, 0, 0
     for k in range(rounds):
@@ -169,7 +169,7 @@ def finding(name: str, k_l: float, half: float, **more: Any) -> Finding:
     return Finding(name, "identification", table, **more)
 
 
-def test_a_population_tells_outliers_and_causes() -> None:
+def test_a_population_reports_outliers_and_causes() -> None:
     rng = np.random.default_rng(2)
     sizes = 7.0 * np.exp(0.01 * rng.standard_normal(30))
     sizes[4] *= 1.2
@@ -269,7 +269,7 @@ def test_a_page_has_not_too_many_devices(tmp_path: Path) -> None:
         ("{", "is not JSON"),
     ],
 )
-def test_files_that_are_none_are_told(content: str, message: str, tmp_path: Path) -> None:
+def test_files_that_are_none_are_reported(content: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.json"
     path.write_text(content)
     with pytest.raises(psa.InputError, match=message):
@@ -280,7 +280,7 @@ def test_files_that_are_none_are_told(content: str, message: str, tmp_path: Path
     ("place", "value"),
     [("verdict", 3), ("causes", {}), ("notes", [1]), ("gain", None), ("noise_floor_rms_m", "x")],
 )
-def test_values_that_do_not_belong_are_told_with_their_place(
+def test_values_that_do_not_belong_are_reported_with_their_place(
     place: str, value: object, files: tuple[Path, Path], tmp_path: Path
 ) -> None:
     content = json.loads(files[0].read_text("utf-8"))
@@ -308,7 +308,7 @@ def devices() -> list[Finding]:
     return items
 
 
-def test_a_population_says_who_stands_out_and_which_batch(tmp_path: Path) -> None:
+def test_a_population_states_who_deviates_and_which_batch(tmp_path: Path) -> None:
     result = population(devices())
     assert {o.device for o in result.outliers} == {"d5"}
     assert result.batches_differ == ("k_L",)
@@ -347,7 +347,7 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     assert (only["name"], len(only["x"])) == ("belongs to the others", 40)
 
 
-def test_a_population_says_whose_fits_miss_their_records() -> None:
+def test_a_population_states_whose_fits_miss_their_records() -> None:
     assert missed_sentences(devices()) == ()
     items = [replace(f, noise_ratio=2.0 + k) if k < 8 else f for k, f in enumerate(devices())]
     (statement,) = missed_sentences(items)
@@ -384,7 +384,7 @@ def device(name: str, seed: int, inertia: float = 3e-5, friction: float = 0.0) -
     return replace(record, name=name)
 
 
-def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
+def test_identifications_of_a_user_model_are_compared(tmp_path: Path) -> None:
     """The third of three motors is heavier by a hundredth; all else is the same."""
     items = [device("first", 1), device("second", 2), device("third", 3, inertia=3.03e-5)]
     results = [psa.identify(motor(), record, starts=1) for record in items]
@@ -415,7 +415,7 @@ def test_identifications_of_an_own_model_are_compared(tmp_path: Path) -> None:
         psa.compare(results[0])
 
 
-def test_a_fit_that_misses_its_record_is_told(tmp_path: Path) -> None:
+def test_a_fit_that_misses_its_record_is_reported(tmp_path: Path) -> None:
     """The second of two motors has dry friction, which the model lacks."""
     items = [device("oiled", 2), device("dry", 1, friction=0.012)]
     results = [psa.identify(motor(), record, starts=1) for record in items]
@@ -436,7 +436,7 @@ def test_a_fit_that_misses_its_record_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_diagnoses_of_an_own_model_are_compared(tmp_path: Path) -> None:
+def test_diagnoses_of_a_user_model_are_compared(tmp_path: Path) -> None:
     fewer = ["hysteresis", "stop", "curve", "delay"]
     items = [device("dry", 1, friction=0.012), device("oiled", 2)]
     dry, oiled = (psa.diagnose(motor(), r, leave_out=fewer) for r in items)

@@ -133,7 +133,7 @@ def task() -> Task:
     return task_of(TRUTH, [record()], free=FREE)
 
 
-def test_a_normal_posterior_is_found() -> None:
+def test_a_normal_posterior_is_recovered() -> None:
     """A straight line with known noise and normal priors: the posterior is normal, by algebra."""
     rng = np.random.default_rng(2)
     slopes, y = rng.standard_normal((30, 3)), rng.standard_normal(30)
@@ -278,7 +278,7 @@ def own_task() -> Task:
     return own_task_of(motor(), records(1), starts=1, zeros=("i",))
 
 
-def test_every_output_of_every_record_has_a_noise_level_of_its_own() -> None:
+def test_every_output_of_every_record_has_a_separate_noise_level() -> None:
     blocks = own_task().density.blocks
     assert [(b.record, own_task().channel(b).column) for b in blocks] == [
         (0, "w"),
@@ -337,7 +337,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     assert "run_2" in result.plot()._suptitle.get_text()  # type: ignore[attr-defined]
 
 
-def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
+def test_what_a_user_model_does_not_take_is_refused() -> None:
     with pytest.raises(psa.InputError, match="'hysteresis' is not among the words"):
         psa.sample(motor(), records(1), hysteresis="friction")
     with pytest.raises(psa.InputError, match="'starts' is not among the words for"):
@@ -349,7 +349,7 @@ def test_what_a_model_of_ones_own_does_not_take_is_refused() -> None:
         psa.sample(motor(), empty)
 
 
-def test_the_command_samples_a_model_of_ones_own(tmp_path: Path) -> None:
+def test_the_command_samples_a_user_model(tmp_path: Path) -> None:
     pytest.importorskip("nutpie")
     psa.save_model(motor(), tmp_path / "motor.json")
     records(1)[0].to_frame().to_csv(tmp_path / "run.csv", index=False)

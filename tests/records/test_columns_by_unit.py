@@ -96,7 +96,7 @@ def test_what_a_name_speaks_against_is_left_alone(
         ("t,U_amp,x", "time=t:s,voltage=U_amp:V,displacement=x:um"),
     ],
 )
-def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
+def test_what_is_open_is_requested_and_never_suggested_against_a_unit(
     head: str, line: str, tmp_path: Path
 ) -> None:
     columns = (T, V, X, X)[: head.count(",") + 1]
@@ -140,7 +140,7 @@ def test_columns_without_a_unit_have_that_of_the_name(tmp_path: Path) -> None:
         (["sep=,", "t [s],u [V],x [um]"], ",", "."),
     ],
 )
-def test_excels_first_line_says_what_separates_the_cells(
+def test_excels_first_line_sets_the_separator(
     head: list[str], mark: str, point: str, tmp_path: Path
 ) -> None:
     path = table(tmp_path / "a.csv", *head, mark=mark, point=point)
@@ -180,7 +180,7 @@ def test_a_recording_of_control_desk_is_read(tmp_path: Path, *, packed: bool) ->
     is_read(read_record(path, columns=columns), x=1e-9)
 
 
-def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
+def test_what_a_recording_leaves_open_is_requested(tmp_path: Path) -> None:
     path = tmp_path / "a.mat"
     for names, (drive, moved) in (
         (("Out1", "Out1"), ("Y.1", "Y.2")),
@@ -214,7 +214,7 @@ def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
     assert head_of(packed, 3) == head
 
 
-def test_what_is_asked_is_guessed_as_it_is_suggested(tmp_path: Path) -> None:
+def test_what_is_requested_is_guessed_as_it_is_suggested(tmp_path: Path) -> None:
     head = head_of(table(tmp_path / "a.csv", "Elapsed (us),CH1,CH2"))
     assert head.guess == fields("us", "V", "um")
     head = head_of(table(tmp_path / "b.csv", "t (s),CH1 (mV),CH2 (mV)"))

@@ -173,7 +173,7 @@ def clear_telegraph(rng: Rng, y: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("noise", [clear_telegraph, steps])
-def test_jumps_are_seen_on_a_wander(noise: Noise) -> None:
+def test_jumps_are_detected_on_a_wander(noise: Noise) -> None:
     kind = noise.__name__.removeprefix("clear_")
     assert sum(kind in kinds for kinds in named_in_records(on_a_wander(noise))) >= 18
 
@@ -231,7 +231,7 @@ def test_a_misfit_of_the_hysteresis_is_no_noise(
     assert sum(each[n] for n in noises) <= 1, each
 
 
-def test_readings_that_are_held_rounded_or_missing_are_told() -> None:
+def test_readings_that_are_held_rounded_or_missing_are_reported() -> None:
     rng = np.random.default_rng(7)
     time, u = TIME, fading(rng)
     y = motion(u)
@@ -288,7 +288,7 @@ def loop_error(voltage: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 @pytest.mark.parametrize("seed", range(4))
-def test_periods_show_level_and_colour_beside_a_large_repeated_error(
+def test_periods_show_level_and_colour_next_to_a_large_repeated_error(
     correlation: float, seed: int
 ) -> None:
     v = sine(20_000)

@@ -76,7 +76,7 @@ def make_record() -> Record:
     return Record(name="r", time=time, voltage=2 * time, displacement=displacement)
 
 
-def test_records_made_in_memory_are_told_apart_by_their_hash() -> None:
+def test_records_made_in_memory_are_distinguished_by_their_hash() -> None:
     record = make_record()
     assert record.sha256 == make_record().sha256
     other = Record(name="r", time=record.time, voltage=record.voltage, displacement=record.voltage)
@@ -304,7 +304,7 @@ def test_mistakes_of_a_row(tmp_path: Path, row: str, expected: str) -> None:
     assert ";" in problems[0]
 
 
-def test_a_quote_that_never_ends_is_told_as_a_mistake(tmp_path: Path) -> None:
+def test_a_quote_that_never_ends_is_reported_as_a_mistake(tmp_path: Path) -> None:
     rows = with_row(4, '0.004,"' + "9" * 200_000 + ",1")
     (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
     assert "line 6, column 'voltage': found '\"999" in problem
@@ -321,7 +321,9 @@ def test_one_file_has_one_decimal_sign(tmp_path: Path) -> None:
         assert f"other numbers of this file have a decimal {name}, write this one so too" in problem
 
 
-def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Path) -> None:
+def test_decimal_commas_between_commas_are_not_a_row_too_long(
+    tmp_path: Path,
+) -> None:
     rows = [f"0,00{k},1,5,0,{k}" for k in range(9)]
     problems = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
     assert "line 2: found 6 cells, expected 3 as in the header; where numbers have" in problems[0]
@@ -335,7 +337,7 @@ def test_decimal_commas_between_commas_are_told_from_a_row_too_long(tmp_path: Pa
         (range(30)[::-1], "the lines are not in the order of time; sort them by it"),
     ],
 )
-def test_many_lines_out_of_order_are_told_in_one_sentence(
+def test_many_lines_out_of_order_are_reported_in_one_sentence(
     order: Sequence[int], problem: str, tmp_path: Path
 ) -> None:
     lines = [f"{k / 1000},{k % 7},{k % 7 / 10}" for k in order]

@@ -95,7 +95,7 @@ def test_a_kick_of_the_load_is_not_suspect() -> None:
 @pytest.mark.parametrize("width", [1, 2, 3])
 @pytest.mark.parametrize("noise", ["white", "coloured", "fine steps"])
 @pytest.mark.parametrize("voltage", ["sine", "triangle", "steps"])
-def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int) -> None:
+def test_spikes_are_detected_and_nothing_else(voltage: str, noise: str, width: int) -> None:
     base = record(voltage, noise)
     y, draw = np.array(base.displacement), np.random.default_rng(4)
     spikes = np.zeros(T.size, dtype=bool)
@@ -110,7 +110,7 @@ def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int)
 
 @pytest.mark.parametrize("value", [0.0, 1.4 * RANGE, -0.3 * RANGE])
 @pytest.mark.parametrize("length", [5, 40, 300])
-def test_drop_outs_are_found(value: float, length: int) -> None:
+def test_drop_outs_are_detected(value: float, length: int) -> None:
     base = record("sine", "white")
     y = np.array(base.displacement)
     starts = [k for k in range(400, 9000, 1300) if abs(y[k] - value) > 0.2 * RANGE]
@@ -127,7 +127,7 @@ def test_drop_outs_are_found(value: float, length: int) -> None:
 
 
 @pytest.mark.parametrize("noise", ["white", "fine steps", "none"])
-def test_a_stuck_sensor_is_found(noise: str) -> None:
+def test_a_stuck_sensor_is_detected(noise: str) -> None:
     base = record("sine", noise)
     y = np.array(base.displacement)
     y[3300:3700] = y[3299]
@@ -282,7 +282,7 @@ def test_spikes_in_any_motion_are_detected(motion: Motion, noise: float) -> None
 
 
 @pytest.mark.parametrize("width", [2, 3])
-def test_a_spike_of_two_or_three_samples_is_found_and_a_step_is_none(width: int) -> None:
+def test_a_spike_of_two_or_three_samples_is_detected_and_a_step_is_none(width: int) -> None:
     rng = np.random.default_rng(1)
     u, y = slow(rng)
     y = y + 1e-3 * np.ptp(y) * rng.standard_normal(N)
@@ -293,7 +293,7 @@ def test_a_spike_of_two_or_three_samples_is_found_and_a_step_is_none(width: int)
     assert not spikes_of(u, y)[505:].any()
 
 
-def test_missing_samples_few_samples_and_what_stands_still_have_no_spikes() -> None:
+def test_missing_samples_few_samples_and_constant_signals_have_no_spikes() -> None:
     rng = np.random.default_rng(1)
     u, y = tones(rng)
     y[rng.choice(N, 100, replace=False)] = np.nan

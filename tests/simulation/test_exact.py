@@ -125,7 +125,7 @@ CASES: list[tuple[str | psa.Component, FloatArray, FloatArray, str]] = [
 
 
 @pytest.mark.parametrize(("what", "t", "relative", "hold"), CASES, ids=range(len(CASES)))
-def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
+def test_held_inputs_few_time_steps_any_start_and_user_components_agree(
     what: str | psa.Component, t: FloatArray, relative: FloatArray, hold: str
 ) -> None:
     """The stepper is taken for a corner of the clip at every jump, and where equations jump."""
@@ -138,7 +138,7 @@ def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
     assert way == (STEPPER if what is JUMP else EXACT) or what == "voltage_saturation"
 
 
-def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
+def test_an_irregular_time_base_is_stepped_and_that_is_reported() -> None:
     model, rng = stack("P-885.51"), np.random.default_rng(3)
     t = 1e-3 * (np.arange(300) + 0.01 * rng.standard_normal(300))
     v = 60.0 * (1.0 - np.cos(20.0 * t))
@@ -244,7 +244,7 @@ def test_every_effect_splits(base: tuple[psa.Component, ...]) -> None:
     ],
     ids=lambda c: getattr(c, "name", ""),
 )
-def test_what_does_not_split_says_why(component: psa.Component, reason: str) -> None:
+def test_what_does_not_split_reports_why(component: psa.Component, reason: str) -> None:
     structure = psa.compose((*psa.BASE, component)).structure
     result = split_of(structure)
     assert isinstance(result, str)

@@ -157,7 +157,7 @@ def sets(model: psa.Model, count: int) -> list[dict[str, float]]:
 
 
 @pytest.mark.parametrize("effect", ["", "load_stiffness", "rate_dependent_hysteresis"])
-def test_a_set_has_the_same_bits_alone_and_beside_others(effect: str) -> None:
+def test_a_set_has_the_same_bits_alone_and_among_others(effect: str) -> None:
     """Nine sets fill two groups of four lanes and begin a third; loops and turns differ by set."""
     model = stack("P-885.51")
     if effect:
@@ -248,7 +248,7 @@ def test_a_set_that_ends_leaves_the_others_alone(host: HostCuda) -> None:
 
 
 @slow
-def test_ports_that_feed_back_are_solved_alike(host: HostCuda) -> None:
+def test_ports_that_feed_back_are_solved_identically(host: HostCuda) -> None:
     """The matrices' ladder is too large for the memory of a thread."""
     model = stack("P-885.51").with_effect(psa.EFFECTS["load_stiffness"], {"load_gain": 0.02})
     values = sets(model, 3)

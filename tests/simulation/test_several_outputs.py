@@ -201,7 +201,7 @@ def test_derivatives_along_the_course_are_those_of_the_whole_model(effect: psa.C
     assert np.std(added - simulated) < max(4e-3, error) * size
 
 
-def test_most_effects_of_the_table_need_no_simulation_of_their_own() -> None:
+def test_most_effects_of_the_table_need_no_separate_simulation() -> None:
     names = {e.name for e in _LAWS}
     assert len(names) >= 16
     assert not names & {"backlash", "hysteresis_memory", "rate_independent_asymmetry"}

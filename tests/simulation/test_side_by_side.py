@@ -160,7 +160,7 @@ def test_the_table_adds_up() -> None:
     )
 
 
-def test_a_diagnosis_tells_its_stages(tmp_path: Path) -> None:
+def test_a_diagnosis_reports_its_stages(tmp_path: Path) -> None:
     grid = time_grid(1.0, 4e-3)
     voltage = triangle(grid, 0.0, 100.0, 4.0)
     noise = 1e-8 * np.random.default_rng(5).standard_normal(grid.size)

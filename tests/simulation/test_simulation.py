@@ -213,7 +213,7 @@ def test_another_stiffness_changes_forces_and_no_displacement(model: psa.Model) 
     assert ratio == pytest.approx(3.0, rel=1e-4)
 
 
-def test_a_start_says_whether_its_force_scale_is_known() -> None:
+def test_a_start_states_whether_its_force_scale_is_known() -> None:
     stack = psa.stack_model("P-885.51")
     assumed = stack.with_values({}, provenance=Provenance(force_scale="assumed"))
     model = stack.with_values({}, provenance=Provenance(force_scale="given"))

@@ -33,7 +33,7 @@ def test_the_exam_shares_no_code_with_what_it_examines() -> None:
         assert not any("psa_casadi" in line or "plants" in line for line in imported)
 
 
-def test_the_records_are_told_apart_and_hide_what_exists() -> None:
+def test_the_records_are_distinguished_and_hide_what_exists() -> None:
     assert len(BY_NAME) == len({record.seed for record in RECORDS}) == 57
     for record in RECORDS:
         assert set(record.hidden) <= set(CAUSES)
@@ -167,7 +167,7 @@ def test_what_is_hidden_is_larger_than_the_noise(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", slow_but(("t_clean_pink_stairs",), CLEAN))
-def test_healthy_stacks_are_healthy_and_their_noise_is_as_large_as_said(name: str) -> None:
+def test_healthy_stacks_are_healthy_and_their_noise_is_as_large_as_stated(name: str) -> None:
     p, statement = play(name, 3), TABLE[name]["noise_um"]
     assert not p.plant.hidden
     assert not question(name).other_hysteresis
@@ -176,7 +176,7 @@ def test_healthy_stacks_are_healthy_and_their_noise_is_as_large_as_said(name: st
     assert spread == pytest.approx(statement, rel={"outliers": 3.0}.get(name.split("_")[2], 0.35))
 
 
-def test_hidden_forms_move_the_reading_as_said() -> None:
+def test_hidden_forms_move_the_reading_as_stated() -> None:
     """A gauge's sag by 1.5 %, a missing code of 0.22 um, no strain beyond where a stage ends."""
     sag = play("r_foreign_brownout", 3)
     step = 1 / TABLE["r_foreign_brownout"]["rate"]
