@@ -9,13 +9,8 @@ from psa_casadi.identification import refitting
 from psa_casadi.identification.refitting import refit_or_keep
 from psa_casadi.records import multisine, time_grid
 from psa_casadi.simulation.stepper import SimulationError
-from tests.identification.identified_plants import (
-    combinations,
-    identified,
-    noise,
-    plant,
-    values_of,
-)
+from tests.identification.identified_plants import combinations, identified, noise, plant
+from tests.model.stack_models import values_of
 from tests.tiers import slow, slow_but
 
 SEEDS = (2, 3, 4)

@@ -29,6 +29,7 @@ from psa_casadi.identification.start.starting_points import (
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
 from tests.identification.paper_cases import transfer
+from tests.model.stack_models import PAPER_STACKS, stack_values
 from tests.studies.benchmarks.coverage import quantities
 from tests.studies.benchmarks.records import (
     clean_loops,
@@ -40,11 +41,6 @@ from tests.studies.benchmarks.records import (
 from tests.tiers import slow, slow_but
 
 Values = Mapping[str, float]
-PAPER = ("PTBS200", "WYDS0808020", "P-885.51")
-
-
-def values_of(name: str) -> dict[str, float]:
-    return {key: figure.value for key, figure in psa.STACKS[name].values.items()}
 
 
 def simulated(
@@ -65,7 +61,7 @@ def noisy(
 
 @cache
 def step_of(name: str, effect: str = "") -> psa.Record:
-    values = values_of(name)
+    values = stack_values(name)
     time, voltage = step_voltage(values)
     return psa.Record(
         name="step",
@@ -117,7 +113,7 @@ STEP_ERRORS = [
 def test_a_step_determines_the_transfer_function(name: str, share: float, first: float) -> None:
     record = step(name, share)
     result = start(record)
-    misfit = errors(result, values_of(name), record)
+    misfit = errors(result, stack_values(name), record)
     assert misfit[0] < first
     assert min(misfit) < 0.06
     assert result[0].misfit == pytest.approx(share, rel=0.1)
@@ -126,7 +122,7 @@ def test_a_step_determines_the_transfer_function(name: str, share: float, first:
 
 def test_a_ringing_step_determines_the_bonding_layers() -> None:
     """Wafers and bonding layers exchanged respond almost equally: both are among the candidates."""
-    record, truth = step("PTBS200", 1e-3), values_of("PTBS200")
+    record, truth = step("PTBS200", 1e-3), stack_values("PTBS200")
     result, k_B = start(record), starting_model([record]).values["k_B"]
     assert result
     assert all({"m_P", "m_B"} <= set(c.determined) for c in result)
@@ -137,9 +133,9 @@ def test_a_ringing_step_determines_the_bonding_layers() -> None:
     assert damping == pytest.approx([1.0] * len(right), rel=0.05)
 
 
-@pytest.mark.parametrize("name", slow_but(["PTBS200"], PAPER))
+@pytest.mark.parametrize("name", slow_but(["PTBS200"], PAPER_STACKS))
 def test_a_multisine_determines_it_in_spite_of_the_loop(name: str) -> None:
-    values = values_of(name)
+    values = stack_values(name)
     time, voltage = multisine_voltage(values, seed=3)
     record = noisy("multisine", time, voltage, simulated(values, time, voltage), 1e-3)
     assert errors(start(record), values, record)[0] < 0.2
@@ -148,7 +144,7 @@ def test_a_multisine_determines_it_in_spite_of_the_loop(name: str) -> None:
 @pytest.mark.parametrize("share", slow_but([1e-3], [1e-3, 1e-2]))
 def test_slow_loops_show_no_dynamics(share: float) -> None:
     """Also where the shape of the loop is not that of play operators."""
-    values = values_of("PTBS200")
+    values = stack_values("PTBS200")
     records = []
     for amplitude, frequency in ((0.3, 1.0), (1.0, 1.0), (0.3, 10.0), (1.0, 10.0)):
         time, voltage = loop_voltage(values, amplitude, frequency)
@@ -197,12 +193,12 @@ def test_gaps_offset_clock_and_polarity_do_not_matter() -> None:
     other = psa.Record(
         name="gaps", time=record.time + 7.0, voltage=record.voltage - 50.0, displacement=3e-5 - x
     )
-    assert errors(start(other), values_of("PTBS200"), other)[0] < 0.05
+    assert errors(start(other), stack_values("PTBS200"), other)[0] < 0.05
 
 
 @slow
 def test_irregular_samples_are_put_on_a_grid() -> None:
-    values, rng = values_of("WYDS0808020"), np.random.default_rng(2)
+    values, rng = stack_values("WYDS0808020"), np.random.default_rng(2)
     time = np.sort(step_of("WYDS0808020").duration * rng.random(4000))
     voltage: FloatArray = np.where(time > 0.05 * time[-1], 200.0, 0.0)
     record = noisy("random", time, voltage, simulated(values, time, voltage), 1e-3)
@@ -212,7 +208,7 @@ def test_irregular_samples_are_put_on_a_grid() -> None:
 @pytest.mark.parametrize("between", [False, True])
 def test_coarse_samples_determine_the_slower_part(between: bool) -> None:
     """Eight samples a period of the ringing; the jump is a ramp of one sample, or lies in it."""
-    values = values_of("PTBS200")
+    values = stack_values("PTBS200")
     fine = step_of("PTBS200")
     time, voltage = fine.time[::5], fine.voltage[::5]
     ramp = simulated(values, time, voltage)
@@ -223,7 +219,7 @@ def test_coarse_samples_determine_the_slower_part(between: bool) -> None:
 
 @slow
 def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
-    values = values_of("WYDS0808020")
+    values = stack_values("WYDS0808020")
     time = np.linspace(0.0, 5e-3, 100_000)
     voltage = np.where(time < 1e-4, 0.0, 200.0)
     record = noisy("long", time, voltage, simulated(values, time, voltage), 1e-3)
@@ -234,7 +230,7 @@ def test_a_long_record_is_cut_to_what_is_fast_and_a_coarse_whole() -> None:
 @pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "structural_mode"]))
 def test_what_the_model_lacks_does_not_mislead(effect: str) -> None:
     record = step("PTBS200", 1e-3, effect)
-    assert min(errors(start(record), values_of("PTBS200"), record)) < 0.15
+    assert min(errors(start(record), stack_values("PTBS200"), record)) < 0.15
 
 
 @pytest.mark.parametrize("seed", slow_but([1], range(4)))
@@ -249,7 +245,7 @@ def test_stacks_of_any_speed(seed: int) -> None:
 @pytest.mark.parametrize("ratio", slow_but([0.6], [1.0, 0.6]))
 def test_a_zero_in_the_band_determines_the_stiffness_ratio(ratio: float) -> None:
     """Ringing wafers, overdamped bonding layers: b of eq. (11) is far from both a_P and a_B."""
-    values = {**values_of("PTBS200"), "tau": 2e-5, "R_s": 5.0}
+    values = {**stack_values("PTBS200"), "tau": 2e-5, "R_s": 5.0}
     values["k_P"] = ratio * values["k_B"]
     for part, omega, damping in (("P", 2e5, 0.05), ("B", 1e5, 1.2)):
         k = values[f"k_{part}"]
@@ -267,7 +263,7 @@ def random_stack(rng: np.random.Generator) -> dict[str, float]:
         return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
     slow = 2.0 * np.pi * between(100.0, 3e5)
-    values = {**values_of("PTBS200"), "k_B": between(1e6, 5e8)}
+    values = {**stack_values("PTBS200"), "k_B": between(1e6, 5e8)}
     values["k_P"] = values["k_B"] * between(1.5, 12.0)
     for part, omega in (("P", slow * between(1.0, 4.0)), ("B", slow)):
         k, damping = values[f"k_{part}"], between(0.02, 2.0)
@@ -280,18 +276,14 @@ def random_stack(rng: np.random.Generator) -> dict[str, float]:
 BENDS = ("beta", "gamma", "delta")
 
 
-def truth(name: str) -> dict[str, float]:
-    return {key: figure.value for key, figure in STACKS[name].values.items()}
-
-
 @cache
 def loops(name: str) -> list[Record]:
-    return clean_loops(truth(name))
+    return clean_loops(stack_values(name))
 
 
 def loop_errors(name: str, records: list[Record]) -> dict[str, float]:
     """Return errors of what the loops show: k, A and the bends over k + A, n as it is."""
-    p = truth(name)
+    p = stack_values(name)
     model = starting_model(records, p["k_B"])
     values = loop_start(model, records)
     assert values is not None
@@ -335,7 +327,7 @@ def replace_from(r: Record, first: int) -> Record:
 
 
 def test_nothing_is_read_where_nothing_turns_or_moves() -> None:
-    p = truth("P-885.51")
+    p = stack_values("P-885.51")
     t, v = step_voltage(p)
     step = Record(name="step", time=t, voltage=v, displacement=1e-7 * v)
     assert loop_start(starting_model([step]), [step]) is None

@@ -21,6 +21,7 @@ from psa_casadi.export.modelica.package import modelica_text
 from psa_casadi.model.nanopositioner import positioner_plant
 from psa_casadi.model.variables import nominal_value
 from tests.export.modelica_runs import simulated
+from tests.model.stack_models import stack_values
 from tests.tiers import slow
 
 Values = Mapping[str, float]
@@ -131,7 +132,7 @@ def simulate_positioner(
 
 
 STACK = "P-885.51"
-VALUES = {name: figure.value for name, figure in psa.STACKS[STACK].values.items()}
+VALUES = stack_values(STACK)
 
 
 def _driven(model: psa.Model, t: FloatArray, **inputs: FloatArray) -> dict[str, FloatArray]:

@@ -14,18 +14,13 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.records import time_grid
 from psa_casadi.reference import Mechanics, Trajectory, from_samples, simulate
 from tests.model.random_models import random_model, random_point
-from tests.model.stack_models import PAPER_STACKS, stack
+from tests.model.stack_models import LINEAR, PAPER_STACKS, plant_of, stack, stack_values
 from tests.studies.plants.base import Run, simulate_base
 from tests.studies.plants.mechanics import two_masses
 from tests.studies.plants.stack import Stack
 from tests.tiers import slow_but
 
-LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 SINGLE = {"m": 7e-3, "c": 90.0, "k": 9.6e7}
-
-
-def values(name: str = "PTBS200", **changes: float) -> dict[str, float]:
-    return {key: figure.value for key, figure in psa.STACKS[name].values.items()} | changes
 
 
 def linear_step(
@@ -68,7 +63,7 @@ def loop_width(trajectory: Trajectory, period: float) -> float:
 
 @pytest.mark.parametrize("stack", sorted(psa.STACKS))
 def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
-    p = values(stack) | LINEAR
+    p = stack_values(stack) | LINEAR
     times = np.linspace(0.0, 3e-3, 601)
     response = simulate(p, lambda _: 100.0, times)
     truth = linear_step(p, 100.0, 0.0, times, np.zeros(6))
@@ -81,7 +76,7 @@ def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
 
 
 def test_jumps_and_load_enter_between_breakpoints() -> None:
-    p = values() | LINEAR
+    p = stack_values("PTBS200") | LINEAR
     times = np.linspace(0.0, 4e-3, 801)
     response = simulate(
         p,
@@ -102,7 +97,7 @@ def test_jumps_and_load_enter_between_breakpoints() -> None:
 
 def test_single_mass_rings_as_its_closed_form() -> None:
     """A light stack let go from x_0: x = x_0 e^(-s t) (cos w t + s/w sin w t)."""
-    p = values() | LINEAR | SINGLE
+    p = stack_values("PTBS200") | LINEAR | SINGLE
     times = np.linspace(0.0, 2e-3, 401)
     response = simulate(
         p, lambda _: 0.0, times, initial={"x": 1e-5}, mechanics="single_mass", rtol=1e-11
@@ -117,7 +112,7 @@ def test_single_mass_rings_as_its_closed_form() -> None:
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_monotonic_ramp_with_n_1_is_an_exponential_in_voltage(sense: float) -> None:
     """From rest upward, f_H = h_ref A/b (1 - e^(-b u/h_ref)) with b = beta - gamma."""
-    p = values(n=1.0, delta=0.0, hold_rate=1e-6)
+    p = stack_values("PTBS200", n=1.0, delta=0.0, hold_rate=1e-6)
     times = np.linspace(0.0, 1.0, 201)
     response = simulate(p, lambda t: sense * 150.0 * t, times)
     u, slope = response.states["u"], p["beta"] - p["gamma"]
@@ -127,7 +122,7 @@ def test_monotonic_ramp_with_n_1_is_an_exponential_in_voltage(sense: float) -> N
 
 
 def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
-    p = values()
+    p = stack_values("PTBS200")
     times = np.array([0.0, 0.099, 0.11, 0.5, 5.0])
     ramp = from_samples(np.array([0.0, 0.1]), np.array([0.0, 150.0]))
     f_H = simulate(p, ramp, times, breakpoints=(0.1,)).states["f_H"]
@@ -138,7 +133,7 @@ def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
 @pytest.mark.parametrize("stack", PAPER_STACKS)
 @pytest.mark.parametrize("share", [0.0, -0.2])
 def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) -> None:
-    p = values(stack)
+    p = stack_values(stack)
     rated, period = p["u_rated"], 1.0
     times = np.linspace(0.0, 2.0, 1001)
     drive = triangle(share * rated, rated, period)
@@ -153,7 +148,7 @@ def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) 
 
 
 def test_every_mistake_is_named_at_once() -> None:
-    p = values(C_p=-1e-6)
+    p = stack_values("PTBS200", C_p=-1e-6)
     del p["beta"]
     with pytest.raises(psa.InputError) as caught:
         simulate(p, lambda _: 0.0, np.array([0.0, 0.0]), initial={"z": 1.0}, rtol=1.0)
@@ -163,14 +158,16 @@ def test_every_mistake_is_named_at_once() -> None:
 
 
 def test_runaway_hysteresis_is_an_error_not_a_curve() -> None:
-    p = values(A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
+    p = stack_values("PTBS200", A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
     with pytest.raises(RuntimeError, match="check these parameters"):
         simulate(p, lambda t: 2000.0 * t, np.array([0.0, 1.0]))
 
 
 def test_a_jump_that_is_no_breakpoint_is_an_error() -> None:
     with pytest.raises(RuntimeError, match="name the jump as a breakpoint"):
-        simulate(values(), lambda t: 100.0 if t < 1e-3 else -30.0, np.array([0.0, 4e-3]))
+        simulate(
+            stack_values("PTBS200"), lambda t: 100.0 if t < 1e-3 else -30.0, np.array([0.0, 4e-3])
+        )
 
 
 #: Samples of the stepper's input, linear in between; a sine's error between them is 5e-9 of it.
@@ -221,9 +218,9 @@ DRIVES = (
 )
 
 
-def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
+def plant_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
     """Return a named stack's values; for the single mass, both masses on springs in series."""
-    p = {name: figure.value for name, figure in psa.STACKS[stack].values.items()}
+    p = stack_values(stack)
     if mechanics == "single_mass":
         k = 1 / (1 / p["k_P"] + 1 / p["k_B"])
         p |= {"m": p["m_P"] + p["m_B"], "k": k, "c": p["c_B"]}
@@ -246,7 +243,7 @@ AGREEMENTS = [*ONCE, *(("WYDS0808020", "single_mass", drive) for drive in DRIVES
 def test_displacement_agrees_with_the_reference(
     stack: str, mechanics: Mechanics, drive: Drive
 ) -> None:
-    p = stack_values(stack, mechanics)
+    p = plant_values(stack, mechanics)
     model = psa.compose(psa.BASE if mechanics == "cascade" else psa.SIMPLIFIED, p)
     size, force = p["u_rated"], FORCE * p["k_L"] * p["u_rated"]
     duration = max(SHORTEST, LAGS * p["tau"])
@@ -288,12 +285,7 @@ def reciprocal(name: str, gain: float, **changes: float) -> psa.Model:
 
 
 def plant(name: str, **changes: float) -> Stack:
-    p = {key: figure.value for key, figure in psa.STACKS[name].values.items()} | changes
-    table = {q: p[q] for q in ("u_rated", "beta", "gamma", "delta", "n", "h_ref", "tau")}
-    return Stack(
-        r_s=p["R_s"], c_p_el=p["C_p"], k_l=p["k_L"], a=p["A"], m_p=p["m_P"], c_p=p["c_P"],
-        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **table,
-    )  # fmt: skip
+    return plant_of(stack_values(name, **changes))
 
 
 def driven(name: str, duration: float, samples: int) -> Run:

@@ -26,7 +26,7 @@ from psa_casadi.simulation.start import start_on
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
-from tests.model.test_reference import stack_values
+from tests.model.test_reference import plant_values
 from tests.simulation.exact_cases import (
     BEAT,
     CUBIC,
@@ -179,7 +179,7 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
 
     The stepper has the corners and every tenth sample only.
     """
-    p = stack_values(stack_name, mechanics)
+    p = plant_values(stack_name, mechanics)
     corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
     levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
     t = times(401, 1e-3)
