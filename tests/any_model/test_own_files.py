@@ -94,9 +94,9 @@ def _matlab(path: Path) -> Path:
     return path
 
 
-def _run(given: Any) -> Experiment:
+def _run(records: Any) -> Experiment:
     model = _pump()
-    (run,) = experiments_of(model, given_to(model, given, None), judged=False)
+    (run,) = experiments_of(model, given_to(model, records, None), judged=False)
     return run
 
 
@@ -105,8 +105,8 @@ def _columns(run: Experiment, names: Sequence[str]) -> FloatArray:
     return np.column_stack([np.asarray(run.record.column(n)) for n in names])
 
 
-def _assert_is_the_record(given: Any) -> None:
-    run = _run(given)
+def _assert_is_the_record(records: Any) -> None:
+    run = _run(records)
     np.testing.assert_allclose(run.record.time - run.record.time[0], T, atol=1e-12)
     np.testing.assert_allclose(
         _columns(run, _pump().input_names), np.column_stack([VALVE, FLOW]), rtol=1e-12
@@ -186,14 +186,14 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
     np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
 
 
-def _refused(given: Any, model: psa.Model | None = None) -> str:
+def _refused(records: Any, model: psa.Model | None = None) -> str:
     with pytest.raises(psa.InputError) as caught:
-        psa.identify(_pump() if model is None else model, given, starts=1)
+        psa.identify(_pump() if model is None else model, records, starts=1)
     return str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             ("valve [%]", "valve [kV]"),
@@ -208,11 +208,11 @@ def _refused(given: Any, model: psa.Model | None = None) -> str:
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_what_to_type(
-    change: tuple[str, str], said: str
+    change: tuple[str, str], message: str
 ) -> None:
     before, after = change
     table = {after if name == before else name: values for name, values in COLUMNS.items()}
-    assert re.search(said, _refused(table), re.DOTALL)
+    assert re.search(message, _refused(table), re.DOTALL)
 
 
 def test_all_mistakes_of_all_records_are_reported_at_once(tmp_path: Path) -> None:

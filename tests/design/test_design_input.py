@@ -132,22 +132,22 @@ ARCS = 6
 _SAMPLES, _TAIL, _EVALUATIONS, _SOLVED = 200, (0.02, 0.002), 200, 1e-6
 
 
-def bang_bang_move(model: psa.Model, found: QuickMove) -> float | None:
+def bang_bang_move(model: psa.Model, movement: QuickMove) -> float | None:
     """Return the length [s] of the stack's bang-bang move that a design leads to.
 
     Between the limits, from the rest in which the design starts, of which x has crept; the search
     starts from the arcs of the design's voltage. None if it does not settle.
     """
-    first = dict(zip(model.state_names, found.response.states[0].tolist(), strict=True))
+    first = dict(zip(model.state_names, movement.response.states[0].tolist(), strict=True))
     initial = {n: first[n] for n in ("u", "f_H", "f_out", "y", "v_y", "x", "v_x")}
-    limits = (found.limits.min_voltage, found.limits.max_voltage)
-    played, length = found.response.voltage[2 : 2 + INTERVALS], found.move_time
-    span, upward = limits[1] - limits[0], found.end > found.begin
+    limits = (movement.limits.min_voltage, movement.limits.max_voltage)
+    played, length = movement.response.voltage[2 : 2 + INTERVALS], movement.move_time
+    span, upward = limits[1] - limits[0], movement.end > movement.begin
     shares = _arcs(played, limits)
 
     def miss(q: FloatArray) -> FloatArray:
         """Return the distances from rest at the end (8,), in percent of the move."""
-        p, move, held = model.values, abs(found.end - found.begin), float(q[-1]) * span
+        p, move, held = model.values, abs(movement.end - movement.begin), float(q[-1]) * span
         ends = np.cumsum(np.maximum(q[:-1] * length, 1e-12))
         time = np.unique(np.concatenate([[0.0], ends, np.linspace(0.0, ends[-1], _SAMPLES)]))
 
@@ -163,7 +163,7 @@ def bang_bang_move(model: psa.Model, found: QuickMove) -> float | None:
         force, c = p["k_L"] * p["G"] * held + s["f_H"], 1.0 / p["k_P"] + 1.0 / p["k_B"]
         w_p, w_b = np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])
         far = [(s["f_out"] - force) * c, s["y"] - force / p["k_P"], s["x"] - force * c,
-               displayed - found.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
+               displayed - movement.end, s["v_y"] / w_p, s["v_x"] / w_b]  # fmt: skip
         return 100.0 * np.array([(s["u"] - p["G"] * held) / span, *(d / move for d in far)])
 
     solved = least_squares(

@@ -24,11 +24,11 @@ BENDS = ("load_stiffness", "sensor_nonlinearity")
 
 
 @pytest.mark.parametrize(
-    ("rate", "free", "alike"),
+    ("rate", "free", "equivalent"),
     [(1e3, ["k_L", "m_B"], (BENDS,)), (2e4, ["k_L"], (BENDS,)), (2e4, ["k_L", "m_B"], ())],
 )
 def test_bends_are_equivalent_where_no_resonance_shows(
-    rate: float, free: list[str], alike: tuple[tuple[str, ...], ...]
+    rate: float, free: list[str], equivalent: tuple[tuple[str, ...], ...]
 ) -> None:
     time = np.arange(200) / rate
     model, voltage = psa.compose(psa.BASE), 10.0 + 10.0 * np.sin(0.02 * rate * time)
@@ -36,7 +36,7 @@ def test_bends_are_equivalent_where_no_resonance_shows(
     experiments = (split(psa.Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
     result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
     groups = Task(experiments, TABLE, STACK).indistinguishable(result)
-    assert tuple(tuple(sorted(group)) for group in groups) == alike
+    assert tuple(tuple(sorted(group)) for group in groups) == equivalent
 
 
 @slow

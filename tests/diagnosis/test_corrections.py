@@ -27,8 +27,8 @@ def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
     return result, experiments, Colour((np.zeros(0),), NOISE, (len(result.residuals),))
 
 
-def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
-    return held_out_rms(experiments, found.predicted(experiments))
+def _held(fit: Fit, experiments: tuple[Experiment, ...]) -> float:
+    return held_out_rms(experiments, fit.predicted(experiments))
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ def shown_up_to(record: Record, share: float) -> Record:
 
 @slow
 @pytest.mark.parametrize(
-    ("share", "effect", "told"),
+    ("share", "effect", "message"),
     [
         (0.12, "self_heating", "only 4 of the readings that count are held out, and no model"),
         pytest.param(
@@ -60,11 +60,11 @@ def shown_up_to(record: Record, share: float) -> Record:
     ],
 )
 def test_a_record_that_hides_nearly_all_names_no_cause(
-    share: float, effect: str, told: str, triangle: Record
+    share: float, effect: str, message: str, triangle: Record
 ) -> None:
     result = diagnose([shown_up_to(triangle, share)], effects=[EFFECTS[effect]])
     assert result.causes == ()
-    assert told in result.doubt
+    assert message in result.doubt
     assert result.doubt in " ".join(story(result).split())
 
 
@@ -92,7 +92,7 @@ def held(record: Record, count: int) -> tuple[Experiment, ...]:
 
 
 @pytest.mark.parametrize(
-    ("count", "interval", "lost", "partly", "hidden", "told"),
+    ("count", "interval", "lost", "partly", "hidden", "message"),
     [
         (15, (50.0, 60.0), -9.0, False, 0.0, "only 15 of the readings that count"),
         (16, (50.0, 60.0), -9.0, False, 0.51, "saturated in 51 % of the readings"),
@@ -108,7 +108,7 @@ def test_what_held_out_samples_confirm(
     lost: float,
     partly: bool,
     hidden: float,
-    told: str,
+    message: str,
     triangle: Record,
 ) -> None:
     experiments = held(triangle, count)
@@ -116,8 +116,8 @@ def test_what_held_out_samples_confirm(
     note = unconfirmed(
         experiments, gain, whole=97.5, lost=lost, partly=partly, hidden=hidden, limits=LIMITS
     )
-    assert told in str(note)
-    assert (note is not None) == bool(told)
+    assert message in str(note)
+    assert (note is not None) == bool(message)
     few = [n for n in coverage_notes(experiments) if n.code == "held_out_says_little"]
     assert len(few) == (count < 16)
 

@@ -163,7 +163,7 @@ def test_a_plant_keeps_it_with_the_covariance_of_its_parameters() -> None:
     assert loads(dumps(plant)).evidence == plant.evidence
 
 
-OWN = {f.__name__: f for f in (oscillator, motor, tanks, pair, cylinder, oven)}
+USER_MODELS = {f.__name__: f for f in (oscillator, motor, tanks, pair, cylinder, oven)}
 
 
 def again(model: Model) -> Model:
@@ -196,10 +196,10 @@ def assert_computes_the_same(model: Model, other: Model, rtol: float = 1e-13) ->
             np.testing.assert_allclose(np.array(b), np.array(a), rtol=rtol, atol=1e-15 * size)
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", USER_MODELS)
 @pytest.mark.parametrize("ported", [False, True])
 def test_a_user_model_comes_back_exactly(name: str, ported: bool) -> None:
-    model = with_ports(OWN[name]()) if ported else OWN[name]()
+    model = with_ports(USER_MODELS[name]()) if ported else USER_MODELS[name]()
     result = again(model)
     assert dict(result.values) == dict(model.values)
     for kind in ("parameters", "states", "inputs", "outputs"):
@@ -209,9 +209,9 @@ def test_a_user_model_comes_back_exactly(name: str, ported: bool) -> None:
     assert_computes_the_same(model, result)
 
 
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", USER_MODELS)
 def test_every_effect_at_a_port_comes_back_exactly(name: str) -> None:
-    model = OWN[name]()
+    model = USER_MODELS[name]()
     ones = dict.fromkeys((*model.input_names, *model.state_names, *model.output_names), 1.0)
     effects = effects_of(model, Sizes(ones, ones, sample=1e-3, duration=1.0))
     assert len(effects) > 10
