@@ -21,9 +21,9 @@ import fmpy
 
 from build_scripts.measured_data import ROOT
 from psa_casadi.common.errors import PsaError
+from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fmu.platforms import PLATFORMS
 from psa_casadi.export.fmu.sources import STRICT, exported_texts
-from psa_casadi.export.nested import config_text
 from psa_casadi.export.web import WEB_FLAGS, module_texts
 from psa_casadi.model.components import BASE
 from psa_casadi.model.compose import compose
@@ -91,9 +91,10 @@ def write_all(sources: Path) -> list[Work]:
     sizes = "".join(f"#define PSA_N{k} {n}\n" for k, n in zip("XUPY", (2, 1, 3, 1), strict=True))
     config = {"imported_config.h": f"#define PSA_IMPORTED_NAME fmu_f\n{sizes}"}
     write(sources / "imported", config, ("imported.c", "imported.h"))
-    nested = config_text(  # of two parts with one wire
-        ['{"a", "a", "a", 1}', '{"b", "b", "b", 0}'], ["{1u, 2u, 0, 1}"], ["{1u, 1}"],
-        ["{1u, 1, 'R', 1.0}"], "{token}", PLATFORMS["x86_64-linux"],
+    nested = filled(  # of two parts with one wire
+        "nested_config.h", parts=[("a", "a", "a", True), ("b", "b", "b", False)],
+        wires=[(1, 2, 0, 1)], shown=[(1, 1)], starts=[(1, 1, "R", 1.0)], token="{token}",
+        target=PLATFORMS["x86_64-linux"],
     )  # fmt: skip
     write(sources / "nested", {"nested_config.h": nested}, ("nested.c",))
     work = [

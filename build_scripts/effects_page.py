@@ -9,9 +9,8 @@ from typing import Any
 import casadi as ca
 from mkdocs.structure.files import File, Files
 
-from psa_casadi.diagnosis.generic.of_rates import effects_of
-from psa_casadi.diagnosis.remedy import example
-from psa_casadi.diagnosis.signature import signature
+from psa_casadi.diagnosis.generic import effects_of
+from psa_casadi.diagnosis.remedy import example, signature
 from psa_casadi.model.component import Component
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES

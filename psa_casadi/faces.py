@@ -78,6 +78,7 @@ def diagnose(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     effects: Sequence[Component] | None = None,
+    leave_out: Sequence[str] = (),
     method: Method | None = None,
     progress: Progress = ...,
 ) -> StackDiagnosis: ...
@@ -118,8 +119,8 @@ def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
     names = [n for n in signature(work).parameters if n not in ("model", "records")]
     for word in words:
         if word not in names:
-            what = "a model of your own" if "known_start" in names else "a stack"
-            raise InputError(f"'{word}' is not among the words for {what}: {', '.join(names)}.")
+            what = "your model" if "known_start" in names else "a stack"
+            raise InputError(f"'{word}' is not among the arguments for {what}: {', '.join(names)}.")
     return words
 
 
@@ -134,5 +135,5 @@ def _models_first(inputs: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model
         )
     records = left.pop(0) if left else words.pop("records", None)
     if records is None or left:
-        raise InputError("Give records, or a model of your own and its records, and words beside.")
+        raise InputError("Give records, or your model and its records; name the other arguments.")
     return model, records

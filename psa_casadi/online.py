@@ -11,14 +11,14 @@ from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.model.component import Component
 from psa_casadi.model.components import COMPONENTS
 from psa_casadi.model.components.online_identification import (
-    ADAPTIVE_FEED_FORWARD,
     COUNT,
-    FEED_FORWARD,
-    HYSTERESIS_OBSERVER,
-    ONLINE_IDENTIFICATION,
     TRACKED,
+    adaptive_feed_forward,
     constants,
     estimates,
+    feed_forward,
+    hysteresis_observer,
+    online_identification,
     variances,
 )
 from psa_casadi.model.compose import Model, compose
@@ -155,7 +155,7 @@ def stack_values(model: Model, period: float, *, at_electrodes: bool = False) ->
     lag -= (p["c_B"] + p["c_P"]) / (p["k_B"] + p["k_P"])
     gain = 1.0 if at_electrodes else p["G"]
     return {
-        **{q.name: q.value for q in ONLINE_IDENTIFICATION.parameters},
+        **{q.name: q.value for q in online_identification.parameters},
         **{n: p[n] for n in ("n", "h_ref")},
         **{n: gain * p[n] for n in ("k_L", "A", "beta", "gamma", "delta")},
         "hold_rate": p["hold_rate"] / gain,
@@ -174,7 +174,7 @@ class HysteresisObserver(Block):
     `values` are those of `stack_values`.
     """
 
-    _component = HYSTERESIS_OBSERVER
+    _component = hysteresis_observer
 
     def step(self, voltage: float) -> float:
         """Take one sample of the voltage [V] and return the hysteresis force [N]."""
@@ -191,7 +191,7 @@ class FeedForward(Following):
     of `stack_values`.
     """
 
-    _component = FEED_FORWARD
+    _component = feed_forward
 
     def step(self, wanted: float) -> float:
         """Return the voltage [V] for a wanted displacement [m].
@@ -228,7 +228,7 @@ def identifier_for(
     if not noise > 0.0:
         raise InputError(f"The noise is {noise:g} m; give the rms error of the sensor, above 0.")
     values |= {"memory": memory, "noise": noise, "spread": spread}
-    return compose([ONLINE_IDENTIFICATION], values, name="online_identification")
+    return compose([online_identification], values, name="online_identification")
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ class OnlineIdentification(_Learning):
     the voltage is held.
     """
 
-    _component = ONLINE_IDENTIFICATION
+    _component = online_identification
 
     def step(self, voltage: float, displacement: float) -> float:
         """Take one sample [V], [m] and return the estimated hysteresis force [N]."""
@@ -288,7 +288,7 @@ class AdaptiveFeedForward(_Learning, Following):
     stiffness, so that the gain from wish to displacement is held too while k_L drifts.
     """
 
-    _component = ADAPTIVE_FEED_FORWARD
+    _component = adaptive_feed_forward
 
     def step(self, wanted: float, measured: float) -> float:
         """Return the voltage [V] for the next wanted displacement [m].

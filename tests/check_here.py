@@ -7,7 +7,7 @@ For FMUs of this package whose code does no harm, faulty as it may be.
 import pickle
 import warnings
 
-from psa_casadi.export.check.measured import Task, checks_of
+from psa_casadi.export.check.apart import Task, checks_of
 from psa_casadi.export.check.rows import CheckRow
 
 

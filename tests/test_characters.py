@@ -37,19 +37,16 @@ WRITERS: dict[str, Callable[[psa.Model], str]] = {
 def described(text: str, name: str = "odd_gain") -> psa.Model:
     """A stack with a text in its description, its notes and the description of a parameter."""
     odd = psa.Component(
-        "odd",
-        f"an effect {text}",
-        "none",
-        lambda s: psa.Equations(add={"displacement": getattr(s, name) * s.u}),
+        "odd", f"an effect {text}", "none",
+        lambda s: psa.Equations(add={"displacement": getattr(s, name) * s.u}), gain=name,
         parameters=(psa.Parameter(name, 0.0, "m/V", (-1.0, 1.0), f"a gain {text}"),),
-        gain=name,
-    )
+    )  # fmt: skip
     model = replace(psa.compose((*psa.BASE, odd)), name="stack", description=f"a stack {text}")
     return replace(model, provenance=replace(model.provenance, notes=(f"a note {text}",)))
 
 
 @pytest.mark.parametrize("character", BARRED, ids=ascii)
-def test_what_no_document_can_carry_is_reported(character: str) -> None:
+def test_what_no_document_can_carry_is_refused(character: str) -> None:
     with pytest.raises(psa.InputError) as caught:
         check_text(f"{'b' * 100}x{character}y", "The page")
     (problem,) = caught.value.problems
@@ -111,9 +108,8 @@ def test_a_page_shows_a_mark_for_what_html_cannot_carry() -> None:
 
 
 def test_what_a_terminal_would_obey_is_spelled_out() -> None:
-    assert visible("a\x1b[31mb\r\x07\x9b2J\x7f\u202e.csv") == (
-        "a\\x1b[31mb\\r\\x07\\x9b2J\\x7f\\u202e.csv"
-    )
+    raw, spelled = "a\x1b[31mb\r\x07\x9b2J\x7f\u202e.csv", r"a\x1b[31mb\r\x07\x9b2J\x7f\u202e.csv"
+    assert visible(raw) == spelled
     assert visible("5 µm\n\tü \U0001f600 \\x1b") == "5 µm\n\tü \U0001f600 \\x1b"
 
 

@@ -20,6 +20,8 @@ from psa_casadi.common.files import (
     temporary_file,
     temporary_folder,
 )
+from tests.contract.helpers import PSA
+from tests.tiers import posix
 
 
 def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -48,13 +50,13 @@ def test_mode_of_an_old_file_and_the_target_of_a_link_are_kept(tmp_path: Path) -
     assert stat.S_IMODE(target.stat().st_mode) == 0o640
 
 
-def test_a_new_file_is_readable_by_the_umask(tmp_path: Path) -> None:
+def test_a_new_file_is_readable_as_the_umask_allows(tmp_path: Path) -> None:
     (tmp_path / "plain").write_text("")
     atomic_write(tmp_path / "ours", "")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="there is no umask that counts")
+@posix
 def test_a_umask_that_lets_nobody_read_leaves_no_folder(tmp_path: Path) -> None:
     before = os.umask(0o777)
     try:
@@ -82,10 +84,9 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         atomic_write(tmp_path / "file" / "below", "")
 
 
-def test_an_input_error_states_one_problem_on_each_line() -> None:
+def test_an_input_error_has_one_problem_on_each_line() -> None:
     error = InputError(["first.", "second."])
-    assert isinstance(error, PsaError)
-    assert isinstance(error, ValueError)
+    assert {PsaError, ValueError} < {*type(error).__mro__}
     assert error.problems == ("first.", "second.")
     assert str(error) == "first.\nsecond."
     assert InputError("only one.").problems == ("only one.",)
@@ -101,8 +102,6 @@ def test_problems_beyond_the_limit_are_counted() -> None:
         problems.raise_if_any()
     assert caught.value.problems == ("mistake 0.", "mistake 1.", "... and 13 more")
 
-
-posix = pytest.mark.skipif(sys.platform == "win32", reason="signals and locks of POSIX")
 
 #: Makes a folder and a half-written file in a place, prints "ready", and waits to be killed.
 HOLDS = """
@@ -127,6 +126,11 @@ def holder(place: Path) -> "subprocess.Popen[str]":
     return child
 
 
+def kill(process: "subprocess.Popen[str]") -> None:
+    process.kill()
+    process.communicate()
+
+
 def swept_again(place: Path) -> list[str]:
     files._SWEPT.discard(place)
     sweep(place)
@@ -137,14 +141,12 @@ def swept_again(place: Path) -> list[str]:
 def test_what_a_killed_process_left_goes_and_what_a_live_one_holds_stays(tmp_path: Path) -> None:
     dead, alive = holder(tmp_path), holder(tmp_path)
     (tmp_path / "model.json").write_text("old")
-    dead.kill()
-    dead.communicate()
+    kill(dead)
     assert len(os.listdir(tmp_path)) == 5
     kept = swept_again(tmp_path)
     assert len(kept) == 3
     assert swept_again(tmp_path) == kept
-    alive.kill()
-    alive.communicate()
+    kill(alive)
     files._SWEPT.discard(tmp_path)
     atomic_write(tmp_path / "other.json", "new")
     assert sorted(os.listdir(tmp_path)) == ["model.json", "other.json"]
@@ -199,12 +201,9 @@ def test_a_child_that_is_not_waited_for_dies_with_its_children(tmp_path: Path) -
     before = signal.signal(signal.SIGALRM, interrupted)
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.2)
+        work = ["sh", "-c", "sleep 60 & echo $! > pid; wait"]
         with pytest.raises(KeyboardInterrupt):
-            run_child(
-                ["sh", "-c", "sleep 60 & echo $! > pid; wait"],
-                directory=tmp_path,
-                environment=os.environ,
-            )
+            run_child(work, directory=tmp_path, environment=os.environ)
     finally:
         signal.signal(signal.SIGALRM, before)
     assert ended(int((tmp_path / "pid").read_text()))
@@ -224,9 +223,8 @@ read_record(sys.argv[2])
 @posix
 def test_a_request_to_end_ends_the_python_that_reads_a_file_too(tmp_path: Path) -> None:
     interpreter, note = tmp_path / "python", tmp_path / "pid"
-    interpreter.write_text(
-        f"#!/bin/sh\nsleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait\n"
-    )
+    work = f"sleep 60 & echo $! > {note}.new; mv {note}.new {note}; wait"
+    interpreter.write_text(f"#!/bin/sh\n{work}\n")
     interpreter.chmod(0o755)
     (tmp_path / "f.mat").write_bytes(b"nothing")
     reading = subprocess.Popen(
@@ -313,14 +311,8 @@ def ended(pid: int) -> bool:
 def test_any_command_sweeps_what_a_killed_one_left_in_the_cache(tmp_path: Path) -> None:
     room = tmp_path / "cache" / "models"
     room.mkdir(parents=True)
-    dead = holder(room)
-    dead.kill()
-    dead.communicate()
+    kill(holder(room))
     assert os.listdir(room)
-    subprocess.run(
-        [sys.executable, "-m", "psa_casadi.cli", "--version"],
-        env={**os.environ, "PSA_CASADI_CACHE": str(tmp_path / "cache")},
-        check=True,
-        stdout=subprocess.DEVNULL,
-    )
+    cache = {**os.environ, "PSA_CASADI_CACHE": str(tmp_path / "cache")}
+    subprocess.run([*PSA, "--version"], env=cache, check=True, stdout=subprocess.DEVNULL)
     assert os.listdir(room) == []

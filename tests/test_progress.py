@@ -23,7 +23,7 @@ def work(count: int, *, progress: Callable[[str], None] = silent) -> int:
     return count
 
 
-def test_a_line_is_displayed_on_a_terminal_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_is_drawn_on_a_terminal_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal, plain, steps = Terminal(), io.StringIO(), list[str]()
     monkeypatch.setattr(sys, "stderr", terminal)
     monkeypatch.setenv("COLUMNS", "40")
@@ -37,7 +37,7 @@ def test_a_line_is_displayed_on_a_terminal_and_goes(monkeypatch: pytest.MonkeyPa
     assert steps[0].startswith("step 4")
 
 
-def test_a_fit_of_any_model_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_of_any_model_reports_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = Terminal()
     record = plants.motor(1, friction=0.0)
     monkeypatch.setattr(sys, "stderr", terminal)

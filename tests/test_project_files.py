@@ -18,31 +18,27 @@ import pytest
 import yaml  # type: ignore[import-untyped]
 from packaging.requirements import Requirement
 
-import psa_casadi
+import psa_casadi as psa
 from build_scripts.measured_data import ROOT
 from psa_casadi.records.read.formats import READERS
-from psa_casadi.version import __version__
-from tests.tiers import slow
+from tests.contract.helpers import PSA
+from tests.tiers import posix, slow
 
 WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 #: What an installed package reads at run time, besides its modules.
 DATA = (
-    "psa_casadi/data/demo.csv",
-    "psa_casadi/py.typed",
-    "psa_casadi/report/page/page.css",
-    "psa_casadi/report/page/page.js",
-    "psa_casadi/report/page/live_model.js",
-    "psa_casadi/examples/recipes/simulink.md",
-    "psa_casadi/fmu_src/instance.c",
-    "psa_casadi/fmu_src/page/page.c",
-    "psa_casadi/fmu_src/windows/start.c",
-    "psa_casadi/fmu_src/LICENSE",
-)
+    "data/demo.csv", "py.typed", "report/page/page.css", "report/page/page.js",
+    "report/page/live_model.js", "examples/recipes/simulink.md", "fmu_src/instance.c",
+    "fmu_src/page/page.c", "fmu_src/windows/start.c", "fmu_src/LICENSE",
+)  # fmt: skip
+
+
+def read_yaml(path: Path) -> Any:
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
 
 
 def _steps(workflow: Path) -> Iterator[dict[str, Any]]:
-    jobs = yaml.safe_load(workflow.read_text(encoding="utf-8"))["jobs"]
-    for job in jobs.values():
+    for job in read_yaml(workflow)["jobs"].values():
         yield from job["steps"]
 
 
@@ -72,14 +68,14 @@ def test_wheel_and_source_archive_are_whole(tmp_path: Path) -> None:
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     (source,) = tmp_path.glob("*.tar.gz")
-    assert wheel.name == f"psa_casadi-{__version__}-py3-none-any.whl"
+    assert wheel.name == f"psa_casadi-{psa.__version__}-py3-none-any.whl"
     with tarfile.open(source) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     assert names >= {"README.md", "docs/index.md", "docs/tutorials/ci.ipynb", "tests/conftest.py"}
     installed, empty = tmp_path / "installed", tmp_path / "empty"
     empty.mkdir()
     with zipfile.ZipFile(wheel) as archive:
-        assert set(archive.namelist()) >= set(DATA)
+        assert set(archive.namelist()) >= {f"psa_casadi/{place}" for place in DATA}
         modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "psa_casadi").rglob("*.py")}
         assert set(archive.namelist()) >= modules
         archive.extractall(installed)
@@ -90,18 +86,13 @@ def test_wheel_and_source_archive_are_whole(tmp_path: Path) -> None:
         "examples van_der_pol -o van_der_pol",
     ):
         done = subprocess.run(
-            [sys.executable, "-m", "psa_casadi.cli", *command.split()],
-            cwd=empty,
-            env=os.environ | {"PYTHONPATH": str(installed)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+            [*PSA, *command.split()], cwd=empty, env=os.environ | {"PYTHONPATH": str(installed)},
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
         assert done.returncode == 0, done.stderr
     assert (empty / "van_der_pol").is_dir()
 
 
-ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 CORE = [Requirement(text) for text in PROJECT["dependencies"]]
 EXTRAS = {
@@ -115,8 +106,6 @@ pytestmark = pytest.mark.xdist_group("dependencies")
 _PARTS = ("body", "orelse", "finalbody", "handlers", "cases")
 #: The extras that a file format needs.
 FORMATS = ("parquet", "tdms", "uff")
-#: And those of other optional packages.
-OTHERS = ("check",)
 CLASSIFIED = [
     c.removeprefix("Programming Language :: Python :: ")
     for c in PROJECT["classifiers"]
@@ -125,16 +114,14 @@ CLASSIFIED = [
 
 
 def test_the_conda_recipe_and_the_metadata_are_those_of_the_package() -> None:
-    text = (ROOT / "build_scripts" / "conda" / "recipe.yaml").read_text(encoding="utf-8")
-    recipe = yaml.safe_load(text)
+    recipe = read_yaml(ROOT / "build_scripts" / "conda" / "recipe.yaml")
     needs = {r.replace("-base", "").replace(" ", "") for r in recipe["requirements"]["run"]}
     assert needs == {str(r) for r in CORE if r.marker is None} | {
         f"python{PROJECT['requires-python']}"
     }
     versions = {recipe["context"]["version"]}
-    for file in ("CITATION.cff", "codemeta.json"):  # JSON is YAML
-        versions.add(yaml.safe_load((ROOT / file).read_text(encoding="utf-8"))["version"])
-    assert versions == {__version__}
+    versions |= {read_yaml(ROOT / f)["version"] for f in ("CITATION.cff", "codemeta.json")}
+    assert versions == {psa.__version__}
 
 
 @cache
@@ -172,22 +159,20 @@ def _third_party() -> frozenset[tuple[Path, str, bool]]:
 
 @pytest.mark.parametrize("extra", ["", *EXTRAS])
 def test_every_requirement_has_a_lower_bound(extra: str) -> None:
-    result = EXTRAS[extra] if extra else CORE
-    assert result
-    for requirement in result:
+    for requirement in EXTRAS[extra] if extra else CORE:
         bounds = [s for s in requirement.specifier if s.operator == ">="]
         assert len(bounds) == (0 if requirement.name == PROJECT["name"] else 1), str(requirement)
 
 
 def test_what_is_imported_is_what_is_required() -> None:
-    optional = {r.name.lower() for extra in (*FORMATS, *OTHERS) for r in EXTRAS[extra]}
+    optional = {r.name.lower() for extra in (*FORMATS, "check") for r in EXTRAS[extra]}
     imported = {name for _, name, _ in _third_party()}
     assert imported - optional == {r.name.replace("-", "_") for r in CORE}
     assert optional <= imported
 
 
 @pytest.mark.parametrize("extra", FORMATS)
-def test_an_optional_package_is_requested_in_a_sentence(extra: str) -> None:
+def test_an_optional_package_is_imported_where_it_is_used(extra: str) -> None:
     names = {r.name.lower() for r in EXTRAS[extra]}
     users = {(path, inside) for path, name, inside in _third_party() if name in names}
     assert users
@@ -202,8 +187,7 @@ def test_the_developers_install_has_every_extra() -> None:
 
 
 def test_the_workflow_runs_every_python_that_is_promised() -> None:
-    text = (ROOT / ".github" / "workflows" / "check.yml").read_text(encoding="utf-8")
-    jobs = yaml.safe_load(text)["jobs"]
+    jobs = read_yaml(ROOT / ".github" / "workflows" / "check.yml")["jobs"]
     assert jobs["quick"]["strategy"]["matrix"]["python"] == CLASSIFIED
     assert PROJECT["requires-python"] == f">={CLASSIFIED[0]}"
     lowest = jobs["lowest"]["strategy"]["matrix"]["python"]
@@ -226,9 +210,9 @@ for name in sys.argv[1:]:
 
 
 @slow
-@pytest.mark.skipif(sys.platform == "win32", reason="os.fork of POSIX")
+@posix
 def test_every_module_can_be_imported_first(tmp_path: Path) -> None:
-    package = Path(psa_casadi.__file__).parent
+    package = Path(psa.__file__).parent
     names = [
         ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
         for path in sorted(package.rglob("*.py"))

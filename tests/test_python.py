@@ -135,7 +135,7 @@ def test_results_are_data_frames() -> None:
     assert {"time [s]", "measured_displacement [m]", "f_H [N]"} <= {*table}
 
 
-def test_one_output_is_drawn_on_the_axes_that_are_passed() -> None:
+def test_one_output_is_drawn_on_axes_of_the_caller() -> None:
     d, matches = diagnosis("cause_named"), identification()
     run, record = psa.simulate(matches.model, T, V), d.experiments[0].record
     axes = Figure().add_subplot()
@@ -264,11 +264,11 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     ),
     "Identification": (
         lambda: swing()[1],
-        lambda i: [*i.fit.outputs(i.experiments), repr(i), i.to_json(), *driven(i.model)],
+        lambda i: [*i.fit.outputs(), repr(i), i.to_json(), *driven(i.model)],
     ),
     "StackIdentification": (
         identification,
-        lambda i: [*i.fit.predicted(i.experiments), repr(i), i.to_json(), i.determinacy.names],
+        lambda i: [*i.fit.predicted(), repr(i), i.to_json(), i.determinacy.names],
     ),
     "StackDiagnosis": (
         lambda: diagnosis("cause_named"),
@@ -276,7 +276,7 @@ EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     ),
     "Diagnosis": (
         lambda: swing()[2],
-        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs(d.experiments)],
+        lambda d: [d.to_json(), repr(d), *driven(d.model), *d.extended_fit.outputs()],
     ),
     "Comparison": (
         lambda: psa.compare(swing()[1], swing()[2]), lambda c: [repr(c), *map(repr, c.differences)],
@@ -349,9 +349,8 @@ def test_components_of_this_package_stay_themselves() -> None:
         model = psa.stack_model(name)
         assert pickle.loads(pickle.dumps(model)).structure is model.structure
     for name in psa.PARTS:
-        assert (
-            pickle.loads(pickle.dumps(psa.part_model(name))).values == psa.part_model(name).values
-        )
+        part = psa.part_model(name)
+        assert pickle.loads(pickle.dumps(part)).values == part.values
 
 
 def test_errors_keep_their_sentences() -> None:
@@ -381,7 +380,7 @@ def test_another_process_predicts_the_same(tmp_path: Path) -> None:
             np.testing.assert_array_equal(y, driven(model)[0])
 
 
-def test_another_fmu_in_its_place_is_reported(tmp_path: Path) -> None:
+def test_another_fmu_in_its_place_is_refused(tmp_path: Path) -> None:
     fmu = psa.export_fmu(psa.part_model("flexure_stage"), tmp_path / "f.fmu")
     kept = pickle.dumps(psa.fmu_model(fmu))
     psa.export_fmu(psa.part_model("prestress_mechanism"), fmu)

@@ -5,30 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psa_casadi.common.errors import InputError
-from psa_casadi.common.units import (
-    UNITS,
-    Power,
-    Unit,
-    convert,
-    parse_unit,
-    to_si,
-    units_of,
-)
+from psa_casadi.common.units import UNITS, Power, Unit, convert, parse_unit, to_si, units_of
 
 # Exponents from the SI brochure, 9th edition, tables 4 and 5; order kg m s A.
 SI_BROCHURE = {
-    "Hz": (0, 0, -1, 0),
-    "N": (1, 1, -2, 0),
-    "Pa": (1, -1, -2, 0),
-    "J": (1, 2, -2, 0),
-    "W": (1, 2, -3, 0),
-    "C": (0, 0, 1, 1),
-    "V": (1, 2, -3, -1),
-    "F": (-1, -2, 4, 2),
-    "Ohm": (1, 2, -3, -2),
-    "S": (-1, -2, 3, 2),
-    "H": (1, 2, -2, -2),
-}
+    "Hz": (0, 0, -1, 0), "N": (1, 1, -2, 0), "Pa": (1, -1, -2, 0), "J": (1, 2, -2, 0),
+    "W": (1, 2, -3, 0), "C": (0, 0, 1, 1), "V": (1, 2, -3, -1), "F": (-1, -2, 4, 2),
+    "Ohm": (1, 2, -3, -2), "S": (-1, -2, 3, 2), "H": (1, 2, -2, -2),
+}  # fmt: skip
 
 # Unit strings of the models: factor and exponents of the base units.
 COMPOUNDS = {

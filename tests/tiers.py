@@ -1,11 +1,15 @@
-"""Marks for the tiers of the tests: the quick one runs by default, the full one has also `slow`."""
+"""Marks of tests: the quick tier runs by default, the full one has also `slow`."""
 
+import sys
 from collections.abc import Collection, Iterable
 from typing import Any
 
 import pytest
 
 slow = pytest.mark.slow
+posix = pytest.mark.skipif(
+    sys.platform == "win32", reason="signals, locks, folders and processes as in POSIX"
+)
 
 
 def slow_but(quick: Collection[Any], cases: Iterable[Any]) -> list[Any]:

@@ -12,9 +12,7 @@ import typer
 from psa_casadi.cli.batch import batch, compare
 from psa_casadi.cli.check import check
 from psa_casadi.cli.demo import demo
-from psa_casadi.cli.design_experiment import experiment
-from psa_casadi.cli.design_input import input_
-from psa_casadi.cli.design_mechanism import mechanism
+from psa_casadi.cli.design import experiment, input_, mechanism
 from psa_casadi.cli.diagnose import diagnose
 from psa_casadi.cli.export import c, fmu, modelica, ssp
 from psa_casadi.cli.failures import guarded, prepare

@@ -10,7 +10,7 @@ import psa_casadi as psa
 from psa_casadi.cli.failures import Case, judge
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.options import Reading, StackName
-from psa_casadi.cli.screen import show, show_table, show_written, working
+from psa_casadi.cli.screen import print_message, show, show_table, show_written, working
 from psa_casadi.common.files import atomic_write
 
 
@@ -73,6 +73,8 @@ def check(
         )  # fmt: skip
     show_table(check_table(report))
     show(f"\n{check_sentence(report)}")
+    if inputs.quiet and not report.passed:
+        print_message(check_sentence(report))
     if json is not None:
         atomic_write(json, json_text(check_file(report)))
         show_written(json)

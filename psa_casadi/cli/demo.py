@@ -13,33 +13,7 @@ from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, show, show_table, width, w
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_write, make_folder
 
-RECORD = "synthetic_record.csv"
-FILES = {
-    RECORD: "the synthetic record: a stack with one effect hidden in it",
-    "model.json": "the base model, identified from the whole record",
-    "extended.json": "the model with the effect that the diagnosis named",
-    "diagnosis.json": "the verdict for machines",
-    "report.html": "the report: open it in a browser",
-    "diagnosis.png": "its picture",
-    "extended.fmu": "the extended model as an FMU (FMI 2.0), checked",
-}
-_ORIGIN = "synthetic"
-#: The effect of its plant, which no step of the demonstration knows.
-HIDDEN = (
-    "Hidden in the record: slow creep by 2.0 % of the elongation for each decade of time, from"
-    " 0.08 s on, without end."
-)
-#: What to do after the demonstration.
-NEXT = """
-Next: open {report} in a browser. Then the same with a record of your own:
-time, voltage and displacement with their units, such as 'voltage [V]', as CSV, Excel, MATLAB,
-LabVIEW or HDF5.
-
-  psa diagnose my_record.csv -o extended.json --report page.html
-  psa export fmu --model extended.json -o stack.fmu
-
-Where a column cannot be told, the message ends with the option to type. Without a record:
-`psa datasets` lists measured ones."""
+RECORD, _ORIGIN = "synthetic_record.csv", "synthetic"
 
 
 def demo(
@@ -62,6 +36,7 @@ def demo(
     from psa_casadi.export.fmu.platforms import make_compiler_ready
     from psa_casadi.identification.identify import identify
     from psa_casadi.identification.start.ordinary import starting_model
+    from psa_casadi.report.words.catalogue import TABLES, say
     from psa_casadi.report.words.tables import check_table
     from psa_casadi.report.words.text import check_sentence
     from psa_casadi.simulation.side_by_side import compiled_ahead
@@ -69,7 +44,7 @@ def demo(
 
     directory, paths = _prepared(Inputs(quiet=quiet), directory, output)
     record = psa.read_record(paths[RECORD], need_excitation=True)
-    show("A synthetic record, made by a simulated stack with one effect hidden in it.")
+    show(say("demo.begin"))
     start = starting_model([record])
     effects = [e for e in psa.EFFECTS.values() if not e.needs_column and not e.inputs]
     searched = reversed(screened_with(start, effects, laws_of(start, [record], effects)))
@@ -88,27 +63,29 @@ def demo(
         psa.write_report(d, paths["report.html"], origin=_ORIGIN, model_file=extended)
         psa.save_figure(d, paths["diagnosis.png"], origin=_ORIGIN)
     text = psa.story(d, origin=_ORIGIN, width=width(), model_file=extended)
-    show(f"\n{text}\n\n{HIDDEN}\n")
+    show(f"\n{text}\n\n{say('demo.hidden')}\n")
     with working("exporting and checking the FMU"):
         exported.result()
         checked = psa.check_fmu(paths["extended.fmu"], d.model)
     show_table(check_table(checked))
-    files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in FILES.items())
+    files = "\n".join(f"  {name:<20}  {meaning}" for name, meaning in TABLES["demo_file"].items())
     show(f"\n{check_sentence(checked)}\n\nleft in {directory}:\n{files}")
     if not checked.passed:
         raise typer.Exit(1)
-    show(NEXT.format(report=paths["report.html"]))
+    show(say("demo.next", report=paths["report.html"]))
 
 
 def _prepared(
     inputs: Inputs, named: Path | None, output: Path | None
 ) -> tuple[Path, dict[str, Path]]:
     """Create the directory, check that every file can be written, copy the record to it."""
+    from psa_casadi.report.words.catalogue import TABLES
+
     if named is not None and output is not None:
         raise InputError(f"{named} and -o {output} name two directories; leave one of them out.")
     directory = named or output or Path("psa_demo")
     make_folder(directory)
-    paths = {name: directory / name for name in FILES}
+    paths = {name: directory / name for name in TABLES["demo_file"]}
     inputs.outputs(paths, [])
     inputs.check()
     packaged = resources.files("psa_casadi").joinpath("data", "demo.csv")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import kept
+from psa_casadi.cli.failures import Outputs
 from psa_casadi.cli.screen import show_results, show_written, working
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.tracking import targets
@@ -20,8 +20,8 @@ from psa_casadi.export.importer import masters
 from psa_casadi.report.page import designs
 from psa_casadi.report.page.document import Picture
 from psa_casadi.report.page.live import live_design
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.design_words import Titled, error_table, limits_table
-from psa_casadi.report.words.phrases import number
 
 _Rows = list[tuple[str, targets.TrackingError]]
 
@@ -46,27 +46,18 @@ def track(task: Task, path: targets.Target, minimax: bool) -> None:
         rows: _Rows = [("designed, full simulator", result.error)]
         for reached in _on_fmu(task, result.response, progress):
             rows.append(("designed, exported FMU", targets.error_of(path, reached)))
-    text = f"{len(path.time)} samples in {number(result.seconds)} s"
+    how = [say("voltage.how", samples=len(path.time), r=result)]
     if result.by_program:
         rows.append(("designed, the program itself", targets.error_of(path, result.predicted)))
-        how = [
-            f"{text}, {result.iterations} iterations of IPOPT.",
-            f"Kinks at reversals were rounded over {number(result.width)} V/s in the program only.",
-        ]
-        if not result.converged:
-            how.append("IPOPT ran out of iterations: a better voltage within limits may exist.")
+        how.append(say("voltage.rounded", r=result))
+        how += [] if result.converged else [say("voltage.not_converged")]
     else:
-        how = [
-            f"{text}.",
-            "The program (IPOPT) found no better voltage within the limits, so this is the"
-            " inversion cut by them and corrected by trials on the simulator. A better one may"
-            " exist.",
-        ]
+        how.append(say("voltage.not_by_program"))
     rows += [
         ("inversion without limits, full simulator", result.inverse.error),
         ("uncompensated, full simulator", targets.error_of(path, plain)),
     ]
-    summary = [_follows(result.error), *targets.binding(result.response, task.limits), *how]
+    summary = [*_follows(task, result.error, result.response), *how]
     badge = "least largest error" if minimax else "least squares"
     pictures = designs.tracking_pictures(result, plain)
     _finish(task, "Designed input", summary, rows, pictures, result.response, path, badge)
@@ -79,9 +70,13 @@ def invert(task: Task, path: targets.Target) -> None:
         rows: _Rows = [("inversion, full simulator", result.error)]
         for reached in _on_fmu(task, result.response, progress):
             rows.append(("inversion, exported FMU", targets.error_of(path, reached)))
-    summary = [_follows(result.error), *targets.binding(result.response, task.limits)]
-    summary.append(f"{len(result.trials)} trials on the simulator.")
-    pictures = designs.inversion_pictures(result, task.limits)
+    summary = _follows(task, result.error, result.response)
+    summary.append(say("voltage.trials", count=len(result.trials)))
+    curve = "inverted, simulated", result.response.displacement
+    pictures = [
+        designs.path_picture("Path and response", result.target, curve),
+        designs.voltage_picture(result.response, task.limits),
+    ]
     _finish(task, "Inverted input", summary, rows, pictures, result.response, path, "inversion")
 
 
@@ -90,14 +85,13 @@ def correct(task: Task, path: targets.Target, trial: "psa.Record") -> None:
     with working("correcting"):
         result = corrected(task.plant, path, trial, task.limits)
     change = float(np.max(np.abs(result.response.voltage - result.played)))
-    summary = [
-        f"The trial missed the path by {number(result.error.rms_percent)} % of its range rms,"
-        f" {number(result.error.largest_percent)} % at most.",
-        f"The voltage changes by {number(change)} V at most; only the next trial can show what that"
-        " is worth.",
-        *targets.binding(result.response, task.limits),
+    summary = [say("voltage.trial", e=result.error), say("voltage.change", change=change)]
+    summary += targets.binding(result.response, task.limits)
+    rows = [("the trial, measured", result.error)]
+    pictures = [
+        designs.path_picture("Path and trial", result.target, ("trial, measured", result.measured)),
+        designs.voltage_picture(result.response, task.limits, result.played),
     ]
-    rows, pictures = [("the trial, measured", result.error)], designs.trial_pictures(result)
     _finish(task, "Corrected input", summary, rows, pictures, result.response, path, "one trial")
 
 
@@ -106,26 +100,15 @@ def move(task: Task, ends: tuple[float, float]) -> None:
     with working("designing") as progress:
         begin, end = (1e-6 * position for position in ends)
         quick = quickest_move(task.plant, begin, end, task.limits, progress=progress)
-        summary = [
-            f"The move takes {number(1e6 * quick.move_time)} us; the linear part alone would take"
-            f" {number(1e6 * quick.linear_time)} us.",
-            f"Behind it the displacement swings by {number(100.0 * quick.residual, 2)} % of the"
-            f" move at most, {number(100.0 * quick.offset, 2)} % off its end, by the simulator.",
-        ]
+        summary = [say("voltage.move", move=quick), say("voltage.behind", move=quick)]
         for reached in _on_fmu(task, quick.response, progress):
             worst = np.max(np.abs(reached - quick.response.displacement)) / abs(end - begin)
-            summary.append(
-                f"The exported FMU differs from the simulator by {number(100.0 * worst, 2)} % of"
-                " the move at most."
-            )
+            summary.append(say("voltage.fmu", worst=worst))
     _finish(task, "Quickest move", summary, [], designs.move_pictures(quick), quick.response)
 
 
-def _follows(error: targets.TrackingError) -> str:
-    return (
-        f"The designed voltage follows the path to {number(error.rms_percent)} % of its range rms,"
-        f" {number(error.largest_percent)} % at most, by the full simulator."
-    )
+def _follows(task: Task, error: targets.TrackingError, response: targets.Response) -> list[str]:
+    return [say("voltage.follows", e=error), *targets.binding(response, task.limits)]
 
 
 @contextmanager
@@ -135,8 +118,8 @@ def _keeping(task: Task, response: targets.Response) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         _write(task, response)
-        output = kept("the voltage was designed before", [task.output], [task.report])
-        raise KeyboardInterrupt(output) from None
+        files = Outputs({"--output": task.output, "--report": task.report}, [task.output])
+        raise files.cut_off("the voltage was designed before") from None
 
 
 def _write(task: Task, response: targets.Response) -> None:

@@ -4,21 +4,21 @@ import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatch
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import judge
-from psa_casadi.cli.inputs import Inputs, meant
+from psa_casadi.cli.failures import Outputs, judge
+from psa_casadi.cli.inputs import Fitting, Inputs, meant, own_model
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName, names
-from psa_casadi.cli.own_model import Fitting, own_diagnosis, own_model
 from psa_casadi.cli.screen import (
     DIAGNOSE,
     events_to,
     show,
-    show_table,
+    show_results,
     show_written,
     width,
     working,
@@ -90,8 +90,8 @@ def diagnose(
         "--output": output, "--patch": patch, "--json": json, "--report": report,
         "--figure": figure,
     }  # fmt: skip
-    began, left_out, held = clock.perf_counter(), leave_out or [], holdout or []
-    healthy = reference or []
+    began, left_out = clock.perf_counter(), leave_out or []
+    paths = records, holdout or [], reference or []
     any_model = own_model(inputs, model, fitting)
     with timed() as spent:
         with stage("loading"):
@@ -100,19 +100,16 @@ def diagnose(
             from psa_casadi.report.words.tables import timings_table
         with stage("reading"):
             _demand_model_name(inputs, output)
-            others = {"--next": next_, "--events": events, "--junit": junit}
-            inputs.outputs({**outputs, **others}, [*records, *held, *healthy, model, fitting.fmu])
+            further = {"--next": next_, "--events": events, "--junit": junit}
+            inputs.outputs(outputs | further, [*chain(*paths), model, fitting.fmu])
             if any_model is None:
-                run = _of_stack(
-                    inputs, reading, (records, held, healthy), model, stack, stiffness, hysteresis,
-                    left_out,
-                )  # fmt: skip
+                start, form = (model, stack), (stiffness, hysteresis)
+                run = _of_stack(inputs, reading, paths, start, form, left_out)
                 _keep_apart(inputs, output, model)
             else:
-                run = own_diagnosis(
-                    any_model, records, held, fitting, reading, inputs, leave_out=left_out,
-                    others={
-                        "--reference": healthy, "--next": next_, "--stack": stack,
+                run = _of_any(
+                    inputs, reading, paths, any_model, fitting, left_out, {
+                        "--reference": reference, "--next": next_, "--stack": stack,
                         "--stiffness": stiffness, "--hysteresis": hysteresis,
                     },
                 )  # fmt: skip
@@ -122,7 +119,7 @@ def diagnose(
             try:
                 d = files.noted(run(progress=progress, watch=watch), left_out)
             except DiagnosisInterrupted as stop:
-                raise KeyboardInterrupt(files.keep_unfinished(stop, outputs)) from None
+                raise files.unfinished(stop, Outputs(outputs)) from None
             place = next_ or next_voltage(json or report)
             d, unpatched = _finish(d, place, outputs, (origin, still), progress)
         with stage("writing"):
@@ -131,8 +128,7 @@ def diagnose(
     show(text)
     _show_files(d, outputs, unpatched)
     if timings:
-        show("")
-        show_table(timings_table(spent.stages))
+        show_results((), [timings_table(spent.stages)])
         show(f"\nprocessor time with the start of Python: {clock.process_time():.2f} s")
     subject = ", ".join(p.name for p in records)
     judge("diagnose", subject, files.cases(d, *wanted), junit, began, show_failures=True)
@@ -143,31 +139,45 @@ def _demand_model_name(inputs: Inputs, output: Path | None) -> None:
         inputs.add(f"{output}: --output is a MODEL.json, which `psa export` takes on; name it so.")
 
 
+#: Records to diagnose, to hold out, and of the healthy device.
+_Paths = tuple[Sequence[Path], Sequence[Path], Sequence[Path]]
+
+
 def _of_stack(
-    inputs: Inputs,
-    reading: Reading,
-    paths: tuple[Sequence[Path], Sequence[Path], Sequence[Path]],
-    model: Path | None,
-    stack: StackName,
-    stiffness: float | None,
-    hysteresis: Hysteresis,
-    left_out: Sequence[str],
-) -> Callable[..., psa.Diagnosis]:
+    inputs: Inputs, reading: Reading, paths: _Paths, start: tuple[Path | None, str | None],
+    form: tuple[float | None, Hysteresis], left_out: Sequence[str],
+) -> Callable[..., psa.Diagnosis]:  # fmt: skip
     """Read the records of a stack; return a function of `progress` and `watch` that diagnoses them.
 
-    `paths` are those to diagnose, to hold out and of the healthy device.
+    `start` is the model or the stack that the fits start from, `form` stiffness and hysteresis.
     """
     from psa_casadi.diagnosis.diagnose import diagnose as run
 
-    effects = _searched(inputs, left_out)
+    effects, (stiffness, hysteresis) = _searched(inputs, left_out), form
     inputs.stiffness(stiffness)
     new, held, healthy = paths
     read = inputs.records([*new, *healthy], reading, held)
     first, last = len(new), inputs.fitted
-    start = inputs.model_or_stack(model, stack, needed=False)
     return partial(
-        run, read[:first], reference=read[first:last], holdout=read[last:], model=start,
-        stiffness=stiffness, hysteresis=hysteresis, effects=effects,
+        run, read[:first], reference=read[first:last], holdout=read[last:],
+        model=inputs.model_or_stack(*start, needed=False), stiffness=stiffness,
+        hysteresis=hysteresis, effects=effects,
+    )  # fmt: skip
+
+
+def _of_any(
+    inputs: Inputs, reading: Reading, paths: _Paths, model: psa.Model, fitting: Fitting,
+    left_out: Sequence[str], others: Mapping[str, object],
+) -> Callable[..., psa.Diagnosis]:  # fmt: skip
+    """Read the records of a model that is no stack; return a function as `_of_stack` does.
+
+    `others` are options that must be empty.
+    """
+    inputs.refuse(others)
+    measured, held = (inputs.signals(model, part, reading) for part in paths[:2])
+    return partial(
+        psa.diagnose, model, measured, holdout=held, leave_out=left_out,
+        effects=inputs.effects_of_any_model(), **fitting.words,
     )  # fmt: skip
 
 
@@ -185,18 +195,17 @@ def _finish(
     from psa_casadi.cli import diagnosis_files as files
     from psa_casadi.simulation.timings import stage
 
-    written: list[Path] = []
-    origin, still = page
+    written, (origin, still) = Outputs(outputs), page
     try:
         with stage("next experiment"):
             d = files.with_next(d, following, progress)
         progress("writing")
         with stage("writing"):
-            files.write(d, {**outputs, "--patch": None}, origin, written, still=still)
+            files.write(d, written, origin, still=still)
         with stage("unnamed correction"):
             return d, files.write_patch(d, outputs["--patch"], progress)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(files.keep(d, outputs, origin, written)) from None
+        raise files.finished(d, written) from None
 
 
 def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None:

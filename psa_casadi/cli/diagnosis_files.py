@@ -1,18 +1,19 @@
 """The files of `psa diagnose`, what an interrupt leaves of them, and what CI asks of a result."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import Case, kept
+from psa_casadi.cli.failures import Case, Outputs
 from psa_casadi.cli.inputs import Inputs, meant
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.files import atomic_write
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.records import write_record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
@@ -46,50 +47,35 @@ def models(d: result.Diagnosis, output: Path | None) -> list[str]:
     return lines
 
 
-def keep_unfinished(stop: result.DiagnosisInterrupted, outputs: Mapping[str, Path | None]) -> str:
-    """Write the best model so far, and say that."""
-    output = outputs["--output"]
-    if output is not None:
-        psa.save_model(stop.model, output)
-    missing = [p for o, p in outputs.items() if o != "--output"]
-    return kept(f"there is no verdict; {stop}", [output], missing, " (marked as interrupted)")
+def unfinished(stop: result.DiagnosisInterrupted, files: Outputs) -> KeyboardInterrupt:
+    """Write the best model so far; return the interrupt that says so."""
+    files.write("--output", lambda path: psa.save_model(stop.model, path))
+    return files.cut_off(f"there is no verdict; {stop}", " (marked as interrupted)")
 
 
-def keep(
-    d: result.Diagnosis, outputs: Mapping[str, Path | None], origin: str, written: list[Path]
-) -> str:
-    """Write what takes no time of a finished diagnosis, and say which files there are."""
-    quick = ("--output", "--json")
-    write(d, {o: p if o in quick else None for o, p in outputs.items()}, origin, written)
-    missing = [p for p in outputs.values() if p not in written]
-    return kept("the diagnosis was finished before", dict.fromkeys(written), missing)
+def finished(d: result.Diagnosis, files: Outputs) -> KeyboardInterrupt:
+    """Write what takes no time of a finished diagnosis; return the interrupt that says so."""
+    write_models(d, files)
+    return files.cut_off("the diagnosis was finished before")
 
 
-def write(
-    d: result.Diagnosis,
-    outputs: Mapping[str, Path | None],
-    origin: str,
-    written: list[Path],
-    *,
-    still: bool = False,
-) -> None:
-    """Write the wanted files, each whole or not at all, and add them to the `written` ones."""
-    extended = None if outputs["--output"] is None else str(outputs["--output"])
-    writers: dict[str, Callable[[Path], None]] = {
-        "--output": lambda path: psa.save_model(d.model, path),
-        "--json": lambda path: atomic_write(path, d.to_json()),
-        "--report": lambda path: psa.write_report(
-            d, path, origin=origin, still=still, model_file=extended
-        ),
-        "--figure": lambda path: psa.save_figure(d, path, origin=origin),
-    }
-    for option, path in outputs.items():
-        if path is not None:
-            writers[option](path)
-            written.append(path)
-    for a, path in alternatives(d, outputs["--output"]):
-        psa.save_model(a.model, path)
-        written.append(path)
+def write_models(d: result.Diagnosis, files: Outputs) -> None:
+    """Write the models, those with another cause too, and the verdict for machines."""
+    files.write("--output", lambda path: psa.save_model(d.model, path))
+    files.write("--json", lambda path: atomic_write(path, d.to_json()))
+    for a, path in alternatives(d, files.named["--output"]):
+        if path not in files.done:
+            psa.save_model(a.model, path)
+            files.done.append(path)
+
+
+def write(d: result.Diagnosis, files: Outputs, origin: str, *, still: bool) -> None:
+    """Write the wanted files, each whole or not at all."""
+    write_models(d, files)
+    extended = str(files.named["--output"]) if files.named["--output"] else None
+    report = partial(psa.write_report, d, origin=origin, still=still, model_file=extended)
+    files.write("--report", report)
+    files.write("--figure", lambda path: psa.save_figure(d, path, origin=origin))
 
 
 def with_next(
@@ -98,7 +84,7 @@ def with_next(
     """Design and write the record that resolves an ambiguous verdict, and say so in the result."""
     if path is None or not isinstance(d, result.StackDiagnosis) or d.verdict != "ambiguous":
         return d
-    contenders, same = one_of_each(d.contenders, d.experiments)
+    contenders, same = one_of_each(d.contenders)
     if same and len(contenders) < 2:
         return d
     before = d.next_experiment

@@ -11,9 +11,8 @@ from typing import Annotated, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs, step_seconds
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model, step_seconds
 from psa_casadi.cli.options import PartName, Published, StackName, Start, names
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_table, show_written, working
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_write, make_folder
@@ -161,8 +160,10 @@ def fmu(
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     targets = inputs.ready(targets)
     if chosen.structure.foreign:
-        if fmi == "3":
-            raise InputError("an FMU that holds another FMU is of FMI 2.0; leave --fmi out.")
+        _refuse_around_fmu({
+            "--fmi 3": fmi == "3", "--platforms": platforms != "host", "--step": seconds,
+            "--name": name, "--sets-to": sets_to, "--validity-output": validity_output,
+        })  # fmt: skip
         psa.export_extended(chosen, output)
         show_written(output)
         return
@@ -180,10 +181,8 @@ def fmu(
         for place, text in sets.items():
             atomic_write(sets_to / place.rpartition("/")[2], text)
     show(f"platforms: {', '.join(t.name for t in targets)}")
-    show(f"start: {_start_words(kept)}")
-    if seconds is None:
-        show(f"evidence: {_evidence_words(kept, len(sets))}")
-    else:
+    _show_start(kept, len(sets) if seconds is None else None)
+    if seconds is not None:
         fixed = json.loads(zipfile.Path(output, FIXED_ENTRY).read_bytes())
         limit = fixed.get("voltage_limit", math.inf)
         _show_step(f"{seconds:g} s", fixed["substeps"], "double", fixed["errors"], limit)
@@ -195,26 +194,26 @@ def fmu(
     show_written(output)
 
 
-def _evidence_words(model: "psa.Model", sets: int) -> str:
-    """Say which evidence an exported model carries, or why none."""
+def _refuse_around_fmu(options: Mapping[str, object]) -> None:
+    """Raise InputError for options with a value that an FMU around another one does not take."""
+    if refused := [option for option, value in options.items() if value]:
+        raise InputError(
+            "an FMU that holds another FMU is of FMI 2.0, for this machine, with the other's"
+            f" steps and names; leave {' and '.join(refused)} out."
+        )
+
+
+def _show_start(model: "psa.Model", sets: int | None) -> None:
+    """Print where an exported model starts, and its evidence, if it has parameter `sets`."""
+    from psa_casadi.report.words.catalogue import say
     from psa_casadi.simulation.start import is_stack
 
-    if model.evidence is not None:
-        of = ", ".join(r.record for r in model.evidence.runs)
-        return f"documentation/evidence.html (records: {of}), {sets} parameter sets"
-    if not is_stack(model):
-        return "none; models of one's own carry none"
-    return "none; a MODEL.json of `psa identify` or `psa diagnose` has it"
-
-
-def _start_words(model: "psa.Model") -> str:
-    """Say where an exported model starts."""
     voltage = next((i.start for i in model.structure.inputs if i.name == "voltage"), None)
-    held = "" if voltage is None else f" at {voltage:.4g} V"
-    if model.own_starts():
-        return f"the start values of the model{held}, as its page lists them"
-    settled = "; --start-voltage starts it settled" if voltage is not None else ""
-    return f"relaxed{held}{settled}"
+    begin = say("command.exported_start", voltage=voltage, own=model.own_starts())
+    show(f"start: {begin}")
+    if sets is not None:
+        evidence = say("command.evidence", model=model, sets=sets, stack=is_stack(model))
+        show(f"evidence: {evidence}")
 
 
 def modelica(

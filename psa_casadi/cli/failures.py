@@ -11,9 +11,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn, ParamSpec
@@ -81,15 +81,26 @@ def _watch(woken: socket.socket, work: Work) -> None:
             leave()
 
 
-def kept(
-    what: str, files: Iterable[Path | None], missing: Iterable[Path | None], mark: str = ""
-) -> str:
-    """Say what an interrupt has cut off, which files there are, and which were not written."""
-    there, absent = (", ".join(str(p) for p in ps if p is not None) for ps in (files, missing))
-    text = (
-        f"{what}. Kept: {there}{mark}." if there else f"{what}; no -o names a file to keep it in."
-    )
-    return f"{text} Not written: {absent}." if absent else text
+@dataclass
+class Outputs:
+    """The files that a command writes, by option; None where one is not wanted."""
+
+    named: Mapping[str, Path | None]
+    done: list[Path] = field(default_factory=list)
+
+    def write(self, option: str, writer: Callable[[Path], object]) -> None:
+        """Write the file of an option, if it is wanted and not there yet."""
+        path = self.named[option]
+        if path is not None and path not in self.done:
+            writer(path)
+            self.done.append(path)
+
+    def cut_off(self, what: str, mark: str = "") -> KeyboardInterrupt:
+        """Return an interrupt that names what it cut off, what is there and what is missing."""
+        missing = ", ".join(str(p) for p in self.named.values() if p and p not in self.done)
+        there = ", ".join(map(str, self.done))
+        kept = f". Kept: {there}{mark}." if there else "; no -o names a file to keep it in."
+        return KeyboardInterrupt(f"{what}{kept}{f' Not written: {missing}.' if missing else ''}")
 
 
 def leave() -> NoReturn:

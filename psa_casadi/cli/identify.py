@@ -3,13 +3,12 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import psa_casadi as psa
-from psa_casadi.cli.failures import kept
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.failures import Outputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Hysteresis, Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import IDENTIFY, print_message, show, show_written, width, working
 from psa_casadi.common.files import atomic_write
 
@@ -55,7 +54,7 @@ def identify(
     from psa_casadi.identification.identify import StackIdentification
     from psa_casadi.identification.identify import identify as of_stack
     from psa_casadi.identification.paper import identify_by_paper
-    from psa_casadi.report.words.advice_words import profile_sentences
+    from psa_casadi.report.words.notes import profile_sentences
     from psa_casadi.report.words.text import identification_text
 
     any_model = own_model(inputs, model, fitting)
@@ -109,7 +108,7 @@ def _refuse_beside_paper(
         inputs.add("--method paper finds Bouc-Wen parameters; leave --hysteresis or --method out.")
 
 
-def _save(model: psa.Model, output: Path) -> None:
+def _save(model: "psa.Model", output: Path) -> None:
     """Write MODEL.json, or start values for what is run elsewhere."""
     if output.suffix.lower() not in (".fmu", ".ssv"):
         psa.save_model(model, output)
@@ -133,32 +132,25 @@ def _finish(
     from psa_casadi.documents.files import identification_file
     from psa_casadi.identification.profile import profile
 
-    output, json, report = outputs.values()
-    done: list[Path] = []
+    files, ended = Outputs(outputs), identification.interrupted
+    save = partial(files.write, "--output", partial(_save, identification.model))
     try:
-        if output is not None:
-            _save(identification.model, output)
-            done.append(output)
-        names = () if identification.interrupted else identification.determinacy.names
-        fit, experiments = identification.fit, identification.experiments
-        profiles = [profile(fit, experiments, n, progress=progress) for n in wanted if n in names]
-        if json is not None:
-            atomic_write(json, json_text(identification_file(identification, profiles)))
-            done.append(json)
-        if report is not None and not identification.interrupted:
+        save()
+        names = () if ended else identification.determinacy.names
+        fit = identification.fit
+        profiles = [profile(fit, n, progress=progress) for n in wanted if n in names]
+        content = partial(identification_file, identification, profiles)
+        files.write("--json", lambda path: atomic_write(path, json_text(content())))
+        if outputs["--report"] is not None and not ended:
             progress("writing the report")
-            psa.write_fit_report(
-                identification, report, origin=page[0], profiles=profiles, still=page[1]
-            )
-        ended = identification.interrupted
+            options: dict[str, Any] = {"origin": page[0], "still": page[1], "profiles": profiles}
+            write = partial(psa.write_fit_report, identification, **options)
+            files.write("--report", write)
     except KeyboardInterrupt:
-        if output is not None and output not in done:
-            _save(identification.model, output)
-            done.append(output)
+        save()
         ended = True
     if not ended:
         return profiles
-    cut = identification.fit.interrupted
-    what = "the search was cut off" if cut else "the fit was finished before"
-    missing = [p for p in outputs.values() if p not in done]
-    raise KeyboardInterrupt(kept(what, done, missing, " (marked as interrupted)" if cut else ""))
+    if identification.fit.interrupted:
+        raise files.cut_off("the search was cut off", " (marked as interrupted)")
+    raise files.cut_off("the fit was finished before")

@@ -1,18 +1,24 @@
-"""The inputs of a command, checked as a whole before any long work starts."""
+"""The inputs of a command, checked as a whole before any long work starts.
+
+Also `--model` that is no stack: a function of a Python file, an FMU, the file of another model.
+"""
 
 import difflib
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import runpy
+import sys
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import psa_casadi as psa
 from psa_casadi.cli.options import Published, Reading, Start
 from psa_casadi.cli.screen import print_message, set_quiet
-from psa_casadi.common.errors import InputError
+from psa_casadi.common.errors import InputError, quoted
 from psa_casadi.common.files import why_not_written
 
 if TYPE_CHECKING:
@@ -129,13 +135,23 @@ class Inputs:
 
     def numbers(self, option: str, texts: Sequence[str] | None) -> dict[str, float]:
         """Return the numbers of an option NAME=VALUE that may be repeated."""
-        values: dict[str, float] = {}
+        form = f"NAME=VALUE, such as {option} mass=0.3"
+        return {name: value for name, (value,) in self.named(option, texts, form).items()}
+
+    def named(
+        self, option: str, texts: Sequence[str] | None, form: str, counts: Container[int] = (1,)
+    ) -> dict[str, tuple[float, ...]]:
+        """Return the numbers of an option NAME=NUMBER:NUMBER: so many as the `counts` allow."""
+        values: dict[str, tuple[float, ...]] = {}
         for text in texts or ():
-            name, _, figure = text.partition("=")
-            try:
-                values[name.strip()] = float(figure)
-            except ValueError:
-                self.add(f"{option} is '{text}'; give NAME=VALUE, such as {option} mass=0.3.")
+            name, _, figures = text.partition("=")
+            numbers: tuple[float, ...] = ()
+            with suppress(ValueError):
+                numbers = tuple(float(figure) for figure in figures.split(":"))
+            if len(numbers) in counts:
+                values[name.strip()] = numbers
+            else:
+                self.add(f"{option} is '{text}'; give {form}.")
         return values
 
     def columns(self, text: str | None, paths: Sequence[Path] | None = None) -> "ColumnMap | None":
@@ -180,7 +196,7 @@ class Inputs:
     ) -> "psa.Model | None":
         """Read a model, or compose a named stack or part; one at most, and one where it is needed.
 
-        With `any_model` the file need not hold a stack.
+        With `any_model` the file need not hold a stack, and FILE.py:FUNCTION makes the model.
         """
         options = {"--model": path, "--stack": stack, "--part": part}
         named = [name for name, value in options.items() if value is not None]
@@ -199,7 +215,8 @@ class Inputs:
                 )
             return None
         if any_model:
-            return self.attempt(lambda: psa.load_model(path, self.user_effects))
+            read = partial(psa.load_model, path, self.user_effects)
+            return self.attempt(lambda: from_python(path) or read())
         return self.model(path)
 
     def turns(self, history: str | None) -> tuple[float, ...]:
@@ -289,8 +306,8 @@ def similar(word: str, known: Iterable[str], otherwise: str) -> str:
     return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
-def step_seconds(text: str) -> float:
-    """Return the time [s] of a step, a number with its unit; none is guessed.
+def step_seconds(text: str, *, plain: bool = False) -> float:
+    """Return the time [s] of a step, a number with its unit; a `plain` number is in seconds.
 
     Raises InputError for anything else.
     """
@@ -302,9 +319,124 @@ def step_seconds(text: str) -> float:
     except ValueError:
         match = None
     if match and not match["unit"].strip():
+        if plain:
+            return number
         meant = " or ".join(f"{match['number']}{unit}" for unit in ("s", "ms", "us"))
         raise InputError(f"--step is '{text}', without a unit; type --step {meant}.")
     unit = parse_unit(match["unit"], "time").name if match else ""
     if unit not in units_of("time"):
         raise InputError(f"--step is '{text}'; give a number with a unit of time, such as 10us.")
     return float(to_si(number, unit))
+
+
+_PYTHON = re.compile(r"(?P<file>.+\.py)(?::(?P<name>\w*))?", re.DOTALL)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitting:
+    """How a model that is no stack is fitted: keyword arguments of `psa.identify(model, records)`.
+
+    Options:
+        fmu: FMU of any tool, in the place of --model.
+        free: Parameter of a model of your own to fit, by default all that may be; repeat the option
+            for several. Of an FMU whose description has no bounds for it, with these:
+            NAME=LOW:HIGH.
+        value: Value of a parameter of an FMU in the place of its own, NAME=VALUE, or of an input
+            that no record has; repeat the option for several.
+        zeros: Output of a model of your own whose zero is unknown in each record; repeat the option
+            for several.
+        hold: What the inputs of a model of your own do between samples; by default what the
+            records make likelier.
+        known_start: The records of a model of your own begin at its declared states.
+    """
+
+    fmu: Path | None = None
+    free: list[str] | None = None
+    value: list[str] | None = None
+    zeros: list[str] | None = None
+    hold: Literal["linear", "zero"] | None = None
+    known_start: bool = False
+
+    @property
+    def words(self) -> dict[str, Any]:
+        """The keyword arguments that have a value, without those that name the model."""
+        every = {n: v for n, v in asdict(self).items() if v and n not in ("fmu", "value")}
+        if self.free:
+            every["free"] = [text.partition("=")[0] for text in self.free]
+        return every
+
+
+def own_model(
+    inputs: Inputs, path: Path | None, fitting: Fitting, *, fitted: bool = True
+) -> psa.Model | None:
+    """Return the model that a path names where it is no stack's; None for a stack's or none.
+
+    Unless it is to be `fitted`, no parameter of an FMU is free.
+
+    A model that cannot be made ends the command.
+    """
+    if fitting.fmu is not None and path is not None:
+        inputs.add("--fmu and --model are both given; leave one of them out.")
+    model = (
+        None if (place := fitting.fmu or path) is None else _model(inputs, place, fitting, fitted)
+    )
+    if model is None or not model.structure.foreign:
+        bounds = [text for text in fitting.free or () if "=" in text]
+        for text in [*bounds, *(fitting.value or ())]:
+            inputs.add(f"'{text}' is said of an FMU; add --fmu FILE.fmu.")
+    if model is None:
+        for name in fitting.words:
+            option = name.replace("_", "-")
+            inputs.add(f"--{option} is said of a model of your own; add --model FILE.py:FUNCTION.")
+    return model
+
+
+def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+    from psa_casadi.simulation.start import is_stack
+
+    if (model := from_python(path)) is not None:
+        return model
+    if path.suffix.lower() == ".fmu" or fitting.fmu:
+        return _imported(inputs, path, fitting, fitted)
+    try:
+        model = psa.load_model(path, inputs.user_effects)
+    except InputError:  # the reader of a stack's file reports it
+        return None
+    return None if is_stack(model) else model
+
+
+def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+    """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
+    form, texts = "NAME=LOW:HIGH, such as --free mass=0.1:10", fitting.free or []
+    bounds = inputs.named("--free", [t for t in texts if "=" in t], form, (2,))
+    free: dict[str, Any] = {n.strip(): bounds.get(n.strip()) for n in fitting.words.get("free", ())}
+    values = inputs.numbers("--value", fitting.value)
+    inputs.check()
+    return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
+
+
+def from_python(path: Path) -> psa.Model | None:
+    """Return the model of FILE.py:FUNCTION, of a function or a variable; None for other paths."""
+    match = _PYTHON.fullmatch(str(path))
+    if match is None:
+        return None
+    file, name = Path(match["file"]), match["name"] or ""
+    if not file.is_file():
+        raise InputError(f"--model: there is no file {file}; check the name and the directory.")
+    sys.path.append(str(file.resolve().parent))  # modules in its folder can be imported
+    try:
+        held = runpy.run_path(str(file), run_name=file.stem)
+        made = held.get(name)
+        model = made() if callable(made) else made
+    except Exception as error:  # the user's own code may raise anything
+        raise InputError(
+            f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
+        ) from error
+    if not isinstance(model, psa.Model):
+        functions = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        known = f"; it has {quoted(functions)}" if functions else ""
+        lacks = f"{file} has no function '{name}' that returns a model{known}. Name one that does"
+        if not name:
+            lacks = f"say which function of {file} returns the model{known}"
+        raise InputError(f"--model: {lacks}, as {file}:{functions[-1] if functions else 'make'}.")
+    return model

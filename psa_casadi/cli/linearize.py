@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model, step_seconds
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written
 
 
@@ -23,7 +22,7 @@ def linearize(
     to: str | None = None,
     observer: Path | None = None,
     noise: list[str] | None = None,
-    step: float = 1e-4,
+    step: str = "100us",
     inputs: Inputs,
 ) -> None:
     """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
@@ -38,18 +37,19 @@ def linearize(
         output: NAME.mat or NAME.json to write: matrices, point, names.
         figure: Bode picture to write, PNG, SVG or PDF as its name ends.
         controller: Transfer function that acts on the setpoint less the output, as "2 50 / 1 0" for
-            (2 s + 50)/s; the loop's margins are told. Needs python-control.
+            (2 s + 50)/s, of which it prints the loop's margins. Needs python-control.
         from_: Input of the loop, where there are several.
         to: Output of the loop, where there are several.
         observer: NAME.fmu to write, or a folder for C: a Kalman filter of the model.
         noise: Standard deviation of the samples of an input or a measured output, NAME=VALUE in SI
             units, for the observer; repeat for several.
-        step: Time between these samples [s], and the step of the observer's C.
+        step: Time between these samples with its unit, and the step of the observer's C.
 
     Example:
         psa linearize --stack P-885.51 --at voltage=60 -o stack.mat --figure bode.png
     """
     from psa_casadi.report.plots.figures import bode_figure, write_figure
+    from psa_casadi.report.words.catalogue import say
 
     inputs.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
     chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
@@ -57,17 +57,12 @@ def linearize(
         chosen = inputs.model_or_stack(model, stack, any_model=True)
     point, states = inputs.numbers("--at", at), inputs.numbers("--state", state)
     sizes, loop = inputs.numbers("--noise", noise), _parsed(inputs, controller)
-    inputs.check()
+    seconds = inputs.attempt(lambda: step_seconds(step, plain=True))
     result = psa.linearize(inputs.ready(chosen), point, states=states)
     show(repr(result))
     if loop is not None:
         m = psa.margins(result, loop, input=from_, output=to)
-        ends = "stable" if m["stable"] else "NOT STABLE"
-        show(
-            f"loop: gain margin {m['gain_margin']:.4g} at {m['gain_margin_at']:.4g} Hz, phase"
-            f" margin {m['phase_margin']:.4g} degrees at {m['phase_margin_at']:.4g} Hz, delay"
-            f" margin {m['delay_margin']:.4g} s; the closed loop is {ends}"
-        )
+        show(say("command.loop", m=m))
     if output is not None:
         result.save(output)
     if figure is not None:
@@ -77,12 +72,12 @@ def linearize(
             result,
             input_noise={n: v for n, v in sizes.items() if n in result.input_names},
             output_noise={n: v for n, v in sizes.items() if n not in result.input_names},
-            step=step,
+            step=inputs.ready(seconds),
         )
         if observer.suffix.lower() == ".fmu":
             psa.export_fmu(made, observer)
         else:
-            psa.export_c(made, observer, step=step)
+            psa.export_c(made, observer, step=inputs.ready(seconds))
     show_written(output, figure, observer)
 
 

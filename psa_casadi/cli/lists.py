@@ -36,8 +36,7 @@ def effects(
     Example:
         psa effects slow_creep --figure creep.png
     """
-    from psa_casadi.diagnosis.remedy import example
-    from psa_casadi.diagnosis.signature import signature
+    from psa_casadi.diagnosis.remedy import example, signature
     from psa_casadi.model.effects.mechanics import MODAL_SERIES
     from psa_casadi.model.own_effects import known_effects
     from psa_casadi.report.plots.figures import save_signature

@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Origin, Reading, StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, width, working
 from psa_casadi.common.files import atomic_write
 
@@ -66,7 +65,9 @@ def sample(
         model, *records = records  # as it was written before there was --model here
     files = {"--output": output, "--json": json, "--figure": figure, "--report": report}
     inputs.outputs(files, [model, *records])
-    centres, widths = _priors(inputs, prior or ())
+    form = "NAME=CENTRE:WIDTH, such as k_L=7.3:0.1"
+    priors = inputs.named("--prior", prior, form, (2,))
+    centres, widths = ({n: pair[k] for n, pair in priors.items()} for k in (0, 1))
     start = own_model(inputs, model, fitting if fitting.fmu else replace(fitting, free=None))
     measured: Sequence[psa.Record | psa.Signals]
     if start is not None:
@@ -92,17 +93,3 @@ def sample(
             psa.report(result, report)
     show(posterior_text(result, origin=origin, width=width()))
     show_written(*files.values())
-
-
-def _priors(inputs: Inputs, texts: Sequence[str]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return centres and widths by the names of the parameters."""
-    centres: dict[str, float] = {}
-    widths: dict[str, float] = {}
-    for text in texts:
-        name, _, figures = text.partition("=")
-        centre, _, spread = figures.partition(":")
-        try:
-            centres[name], widths[name] = float(centre), float(spread)
-        except ValueError:
-            inputs.add(f"--prior is '{text}'; give NAME=CENTRE:WIDTH, such as k_L=7.3:0.1.")
-    return centres, widths

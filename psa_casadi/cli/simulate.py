@@ -7,9 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Reading, StackName, Start
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import show, show_written, working
 from psa_casadi.common.display import with_units
 from psa_casadi.common.errors import Problems
@@ -131,13 +130,11 @@ def _changed(model: "psa.Model", values: dict[str, float], starts: dict[str, flo
 
 def _start_values(model: "psa.Model", starts: dict[str, float]) -> str:
     """Say that the model's start values hold, and which of them --start has set."""
-    from psa_casadi.report.words.phrases import with_unit
+    from psa_casadi.report.words.catalogue import say
 
     every: list[psa.State | psa.Input] = [*model.structure.states, *model.structure.inputs]
     units = {v.name: v.unit for v in every}
-    texts = [f"{n} = {with_unit(f'{v:.6g}', units[n])}" for n, v in starts.items()]
-    others = f", but for {', '.join(texts)}" if texts else ""
-    return f"the start values of the model{others}"
+    return say("command.start_values", starts=[(n, v, units[n]) for n, v in starts.items()])
 
 
 def _of_a_stack(
@@ -180,21 +177,12 @@ def start_sentence(
 
     `values` is the text for start values, if it starts at these.
     """
+    from psa_casadi.report.words.catalogue import say
     from psa_casadi.simulation.start import initial_slope
 
     first = float(record.voltage[0])
     if values:
         held = next(i.start for i in model.structure.inputs if i.name == "voltage")
-        step = f"; the record begins with a step from there to {first:.4g} V" * (held != first)
-        return f"{values}, at {held:.4g} V, as an exported FMU has them{step}"
-    memory = "relaxed" if history is None else f"where the history {history} V leaves them"
+        return say("command.as_exported", values=values, held=held, first=first)
     rate = initial_slope(record.time, record.voltage)
-    moving = f", moving at {rate:.4g} V/s" if rate else ""
-    option = f"--start-voltage {first:.4g}" + ("" if history is None else f" --history {history}")
-    text = f"an FMU of it begins at rest there with {option}"
-    if history is None and first:
-        text = (
-            f"an FMU with {option} has risen there from 0 V, which its hysteresis remembers:"
-            f" give {option} here too to begin as it does"
-        )
-    return f"settled at {first:.4g} V{moving}, hysteresis and creep {memory}; {text}"
+    return say("command.settled", first=first, rate=rate, history=history)

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import StackName
-from psa_casadi.cli.own_model import Fitting, own_model
 from psa_casadi.cli.screen import print_message, show_always, show_written, working
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import temporary_folder

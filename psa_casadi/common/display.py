@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 _TEXTS = {
     "note_text": "psa_casadi.report.words.notes",
     "diagnosis_text": "psa_casadi.report.words.text",
-    "sentence_of": "psa_casadi.report.words.advice_words",
+    "sentence_of": "psa_casadi.report.words.notes",
     "identification_file": "psa_casadi.documents.files",
 }
 

@@ -144,8 +144,10 @@ def _locked(place: Path, ending: str, make: Callable[[Path], None]) -> tuple[Pat
         path = place / f"{PREFIX}{secrets.token_hex(4)}{ending}"
         try:
             make(path)
-        except FileExistsError:
-            continue
+        except (FileExistsError, FileNotFoundError):  # the name is taken, or was swept at once
+            if place.is_dir():
+                continue
+            raise
         _MADE.add(path)
         try:
             with contextlib.suppress(BlockingIOError, FileNotFoundError):

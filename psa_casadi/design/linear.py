@@ -219,7 +219,13 @@ def margins(
     """
     control = _control()
     plant = of.to_control()[_one(of.output_names, output), _one(of.input_names, input)]
-    loop = plant * control.tf(*map(list, controller))
+    try:
+        loop = plant * control.tf(*map(list, controller))
+    except ValueError as error:
+        raise InputError(
+            f"The controller is no transfer function ({error}); give numerator and denominator, the"
+            " latter of the same or a higher degree."
+        ) from error
     gain, phase, _, at_gain, at_phase, _ = control.stability_margins(loop)
     closed = control.feedback(loop, 1)
     return {
@@ -247,22 +253,19 @@ def observer(
     show a mode that is not damped.
     """
     rows = [_one(of.output_names, n) for n in output_noise]
-    if not rows or not all(v > 0 for v in output_noise.values()):
+    if not rows:
         raise InputError(
             "An observer needs the noise of one measured output at least: `output_noise`, --noise."
         )
+    for name, size in {**input_noise, **output_noise}.items():
+        if not 0.0 < size < np.inf:
+            raise InputError(f"The noise of '{name}' is {size:g}; give a positive number.")
     w = np.zeros(len(of.u))
     for name, size in input_noise.items():
         w[_one(of.input_names, name)] = size**2 * step
-    v = np.diag([size**2 * step for size in output_noise.values()])
+    v = step * np.array([*output_noise.values()]) ** 2
     c, d = of.c[rows], of.d[rows]
-    try:
-        p = scipy.linalg.solve_continuous_are(of.a.T, c.T, of.b @ np.diag(w) @ of.b.T, v)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise InputError(
-            f"No Kalman filter is found ({error}); measure more outputs, or give inputs noise."
-        ) from error
-    gain = p @ c.T @ np.linalg.inv(v)
+    gain = _kalman_gain(of, w, c, v)
     names = [f"measured_{of.output_names[r]}" for r in rows]
     x, u, y = (
         ca.vertcat(ca.SX(0, 1), *(ca.SX.sym(n) for n in group))
@@ -293,6 +296,27 @@ def observer(
         description=f"stationary Kalman filter of '{of.name}'",
         source="Kalman and Bucy, J. Basic Eng. 83 (1961), 95",
     )  # fmt: skip
+
+
+def _kalman_gain(of: Linear, w: FloatArray, c: FloatArray, v: FloatArray) -> FloatArray:
+    """Return L (nx, ny) for the intensities w (nu,) of inputs and v (ny,) of outputs C x.
+
+    Riccati's equation is solved in states over their usual sizes and outputs over their noise: in
+    SI units the entries of a stack differ by 1e20. Raises InputError where no filter is stable.
+    """
+    sizes, deviation = np.array([s.nominal for s in of.states], dtype=float), np.sqrt(v)
+    a, reading = of.a / sizes[:, None] * sizes, c * sizes / deviation[:, None]
+    driven = of.b / sizes[:, None] * np.sqrt(w)
+    problem, p = "its error would grow", np.full_like(a, np.nan)
+    try:
+        p = scipy.linalg.solve_continuous_are(a.T, reading.T, driven @ driven.T, np.eye(len(v)))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        problem = str(error)
+    if not np.isfinite(p).all() or any(np.linalg.eigvals(a - p @ reading.T @ reading).real >= 0.0):
+        raise InputError(
+            f"No Kalman filter is found ({problem}); measure more outputs, or give inputs noise."
+        )
+    return np.asarray(p @ reading.T * sizes[:, None] / deviation)
 
 
 def _sized(variable: V, model: Model) -> V:

@@ -22,6 +22,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +43,11 @@ from psa_casadi.devices.jobs import (
     key_of,
 )
 from psa_casadi.documents.files import DEVICE_FORMAT as FORMAT
-from psa_casadi.documents.files import DeviceFile, DeviceRecord, damage, hash_of
+from psa_casadi.documents.files import DeviceFile, RecordUsed, copied, damage, hash_of
 from psa_casadi.documents.findings import DEVICE_FILE, device_finding, finding_content
 from psa_casadi.model.component import Component
 from psa_casadi.model.own_effects import own_effects
-from psa_casadi.population.finding import Finding
+from psa_casadi.population.population import Finding
 from psa_casadi.version import __version__
 
 
@@ -97,21 +98,13 @@ class Results:
         (here / DEVICE_FILE).unlink(missing_ok=True)
         for name, text in outcome.files:
             atomic_write(here / name, text)
-        device_file = DeviceFile(
-            FORMAT,
-            job.device,
-            job.batch,
-            job.day.isoformat() if job.day else "",
-            options.work,
-            outcome.status,
-            outcome.problems,
-            round(outcome.seconds, 3),
-            key,
-            __version__,
-            tuple(DeviceRecord(name, sha) for name, sha in outcome.records),
-            tuple(name for name, _ in outcome.files),
-            tuple(hash_of(text.encode()) for _, text in outcome.files),
-        )
+        device_file = copied(
+            DeviceFile, outcome, format=FORMAT, batch=job.batch, work=options.work, key=key,
+            date=job.day.isoformat() if job.day else "", seconds=round(outcome.seconds, 3),
+            package_version=__version__, records=tuple(starmap(RecordUsed, outcome.records)),
+            files=tuple(name for name, _ in outcome.files),
+            sha256=tuple(hash_of(text.encode()) for _, text in outcome.files),
+        )  # fmt: skip
         atomic_write(here / DEVICE_FILE, json_text(asdict(device_file)))
         return device_file
 

@@ -76,19 +76,19 @@ def images(tone: float, rate: float, most: int) -> list[float]:
     return [share * rate for share in sorted(result)]
 
 
-def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
+def ringing(fit: Fit) -> Ringing | None:
     """Return the tone that explains most of a residual; None where no record can show one.
 
     The residual is whitened by an autoregression fitted to it, so that a tone has to follow the
     force to count: one that is there all the time counts as colour.
     """
-    interval = min(e.record.sample_time for e in fitted(experiments))
+    interval, experiments = _interval(fit), fit.experiments
     forces = [
         None if e.held_out_whole else _force(fit, k, e, interval) for k, e in enumerate(experiments)
     ]
     if all(f is None for f in forces):
         return None
-    colour = residual_colour(fit.residuals, [int(e.used.sum()) for e in experiments])
+    colour = residual_colour(fit.record_residuals)
     basis = independent(colour.whiten(fit.jacobian))
     residual = without(colour.whiten(fit.residuals), basis)
     best: Ringing | None = None
@@ -100,6 +100,11 @@ def ringing(fit: Fit, experiments: Sequence[Experiment]) -> Ringing | None:
             if best is None or decrease > best.decrease:
                 best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
     return best
+
+
+def _interval(fit: Fit) -> float:
+    """Return the shortest sampling interval of the fitted records [s]."""
+    return min(e.record.sample_time for e in fitted(fit.experiments))
 
 
 def _explained(columns: FloatArray, residual: FloatArray) -> float:
@@ -187,7 +192,7 @@ _SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
 
 
 @stage("base fit again")
-def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+def from_resonances(base: Fit, progress: Progress) -> Fit | None:
     """Fit the base from resonances and lags that fast records show; None if none explain more.
 
     Ordinary lags lead nowhere for a stack that rings within the record's band. The search starts
@@ -195,17 +200,16 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
     """
     if "k_P" not in base.model.values:
         return None
-    records = [e.record for e in fitted(experiments)]
+    records = [e.record for e in fitted(base.experiments)]
     progress("resonances and lags")
     linear = linear_start(records, base.model.values)
-    fastest = min(r.sample_time for r in records)
-    if not resolved(base.model, linear, fastest):
+    if not resolved(base.model, linear, _interval(base)):
         return None
     ordinary = base.model.with_values(ordinary_values(base.model, records))
     best = base
     for model in (ordinary, base.model):
         with suppress(PsaError):
-            searched = search(model, experiments, linear=linear, progress=progress).best
+            searched = search(model, base.experiments, linear=linear, progress=progress).best
             best = min(best, searched, key=lambda f: f.rms)
             if searched.cost < _AGAIN * len(searched.residuals):
                 break
@@ -213,7 +217,7 @@ def from_resonances(base: Fit, experiments: Sequence[Experiment], progress: Prog
 
 
 @stage("base fit again")
-def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit | None:
+def from_band(before: Fit, progress: Progress) -> Fit | None:
     """Fit with resonances near or above the band; None where none explains much more.
 
     Steps excite such a resonance, and what a slow record shows of its ringing looks like noise
@@ -221,19 +225,17 @@ def from_band(before: Fit, experiments: Sequence[Experiment], progress: Progress
     """
     result = before
     for _ in range(_RESONANCES):
-        more = _with_ringing(result, experiments, progress, SEEN)
+        more = _with_ringing(result, progress, SEEN)
         if more is None:
             break
         result = more
     if result.rms > _MUCH * before.rms:
         return None
-    return result if before.model.effects else _tuned(result, experiments, progress)
+    return result if before.model.effects else _tuned(result, progress)
 
 
 @stage("base fit again")
-def instead_of_mode(
-    before: Fit, mode: Component, fit: Fit, experiments: Sequence[Experiment], progress: Progress
-) -> Fit | None:
+def instead_of_mode(before: Fit, mode: Component, fit: Fit, progress: Progress) -> Fit | None:
     """Fit with a resonance of the stack in the place of the further mode in `fit`.
 
     `before` is the model to which the mode was added. A stack that rings near the sampling rate
@@ -244,31 +246,29 @@ def instead_of_mode(
     progress("base fit, mode as resonance")
     values = fit.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
-    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
+    rate = 1.0 / _interval(fit)
     near = images(tone, rate, _NEAR_IMAGES)
     starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
-    return _with_masses(before, starts, experiments, _as_good(fit, _AS_GOOD))
+    return _with_masses(before, starts, _as_good(fit, _AS_GOOD))
 
 
 @stage("base fit again")
-def instead_of(
-    base: Fit, fit: Fit, experiments: Sequence[Experiment], progress: Progress
-) -> Fit | None:
+def instead_of(base: Fit, fit: Fit, progress: Progress) -> Fit | None:
     """Fit the base with its resonances in the place of the effect in `fit`.
 
     None where no masses explain the data about as well as the effect. A resonance above the band
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
     what looks like a further mode.
     """
-    rung = _with_ringing(base, experiments, progress, least=_as_good(fit, _LIKE))
+    rung = _with_ringing(base, progress, least=_as_good(fit, _LIKE))
     if rung is not None and _short(rung, fit) < _LIKE:
-        return _tuned(rung, experiments, progress)
-    if not shows_ringing(experiments):
+        return _tuned(rung, progress)
+    if not shows_ringing(base.experiments):
         return None
-    again = retuned(base, experiments, progress, reached=fit.rms)
+    again = retuned(base, progress, reached=fit.rms)
     if _short(base, again) <= _CLEAR:
         return None
-    return without_blur(again, experiments) if _short(again, fit) < _LIKE else None
+    return without_blur(again) if _short(again, fit) < _LIKE else None
 
 
 def rings(effect: Component) -> bool:
@@ -276,12 +276,12 @@ def rings(effect: Component) -> bool:
     return effect.tone is not None and effect.belongs_to == "plant"
 
 
-def _tuned(fit: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def _tuned(fit: Fit, progress: Progress) -> Fit:
     """Return the fit with its mechanics sought again while it rings; k_P is free if determined."""
-    left = ringing(fit, experiments)
+    left = ringing(fit)
     if left is None or left.decrease >= SEEN:
-        fit = retuned(fit, experiments, progress)
-    return without_blur(fit, experiments)
+        fit = retuned(fit, progress)
+    return without_blur(fit)
 
 
 def _short(fit: Fit, other: Fit) -> float:
@@ -295,11 +295,7 @@ def _as_good(other: Fit, short: float) -> float:
 
 
 def _with_ringing(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    progress: Progress,
-    value: float = 0.0,
-    least: float = np.inf,
+    fit: Fit, progress: Progress, value: float = 0.0, least: float = np.inf
 ) -> Fit | None:
     """Fit with a mass free, from the resonances that the residual's ringing may be of.
 
@@ -307,15 +303,15 @@ def _with_ringing(
     explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
     elsewhere, too.
     """
-    rate = 1.0 / min(e.record.sample_time for e in fitted(experiments))
+    rate = 1.0 / _interval(fit)
     if rate <= _SHOWS:
         return None
-    tone = ringing(fit, experiments)
+    tone = ringing(fit)
     if tone is None or tone.decrease < value:
         return None
     progress(f"base fit, resonance at {tone.tone:.3g} Hz")
     starts = [m for f, z in tone.resonances for m in _masses(fit.model.values, [f], z)]
-    return _with_masses(fit, starts, experiments, least)
+    return _with_masses(fit, starts, least)
 
 
 def _masses(
@@ -330,10 +326,7 @@ def _masses(
 
 
 def _with_masses(
-    before: Fit,
-    starts: Sequence[Mapping[str, float]],
-    experiments: Sequence[Experiment],
-    least: float = np.inf,
+    before: Fit, starts: Sequence[Mapping[str, float]], least: float = np.inf
 ) -> Fit | None:
     """Fit with one mass free from several starts; None where none explains clearly more.
 
@@ -344,13 +337,13 @@ def _with_masses(
     def fit_from(start: Mapping[str, float]) -> Fit | None:
         free = [*before.unknowns.names, *(n for n in start if n not in before.unknowns.names)]
         return quick_from(
-            before, before.model, experiments, free,
+            before, before.model, free,
             start_states=before.starts(), evaluations=_FIRST, start=start,
         )  # fmt: skip
 
     def further(quick: Fit) -> Fit | None:
         return quick_from(
-            quick, quick.model, experiments, quick.unknowns.names,
+            quick, quick.model, quick.unknowns.names,
             start_states=quick.starts(), evaluations=_QUICK,
         )  # fmt: skip
 
@@ -361,7 +354,7 @@ def _with_masses(
     if best is None:
         return None
     try:
-        final = refit(best, experiments, best.unknowns.names, least=least)
+        final = refit(best, least=least)
     except PsaError:
         return None
     return final if _short(before, final) > _CLEAR else None

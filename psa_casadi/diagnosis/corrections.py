@@ -17,6 +17,10 @@ data, p_k the shape of the prior, smooth where 1/k or steeper. Quantities are ov
 
 Stops and plays: Visintin 1994; their squares and cubes make loops that are asymmetric or S-shaped
 (generalised Prandtl-Ishlinskii, Al Janaideh, Rakheja and Su 2009).
+
+What data say of a cause first is its family, the place where it sits and what it does. Which effect
+of a family it is comes second, and it may be none that is listed: unnamed corrections of other
+kinds compete with the listed effects on the scale of evidence.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -36,7 +40,7 @@ from psa_casadi.diagnosis.task import LIMITS, Thresholds, shows_ringing
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.refitting import POLISH
 from psa_casadi.identification.start.linear_response import plays
-from psa_casadi.model.component import Component
+from psa_casadi.model.component import Component, Kind
 from psa_casadi.model.compose import Model
 from psa_casadi.model.effects import patches
 from psa_casadi.records.noise import filtered
@@ -75,7 +79,7 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Kind:
+class Form:
     """One form at one port: its name, its columns of a record (n, k) and the prior's shape (k,)."""
 
     name: str
@@ -158,26 +162,22 @@ def _relaxed(x: FloatArray, step: FloatArray, tau: float) -> FloatArray:
     return z
 
 
-def _flat(count: int) -> FloatArray:
-    return np.ones(count)
-
-
 def _smooth(count: int) -> FloatArray:
     return 1.0 / np.arange(1, count + 1)
 
 
 KINDS = (
-    Kind("curve", "drive voltage",
+    Form("curve", "drive voltage",
          lambda s, k: s.respond(k, _cosines(s.voltage(k), 1, patches.CURVE)), _smooth),
-    Kind("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, patches.CURVE), _smooth),
-    Kind("curve", "force",
+    Form("curve", "reading", lambda s, k: _cosines(s.displacement(k), 1, patches.CURVE), _smooth),
+    Form("curve", "force",
          lambda s, k: s.respond(k, _cosines(s.displacement(k), 1, patches.CURVE)), _smooth, True),
-    Kind("direction", "force", _direction, _smooth),
-    Kind("memory", "force", _memory, _flat),
-    Kind("relaxation", "force", _relaxation, _flat),
-    Kind("modes", "force", _modes, _flat),
-    Kind("time", "reading", _time, _smooth),
-    Kind("gain in time", "force",
+    Form("direction", "force", _direction, _smooth),
+    Form("memory", "force", _memory, np.ones),
+    Form("relaxation", "force", _relaxation, np.ones),
+    Form("modes", "force", _modes, np.ones),
+    Form("time", "reading", _time, _smooth),
+    Form("gain in time", "force",
          lambda s, k: s.displacement(k)[:, None] * _time(s, k), _smooth),
 )  # fmt: skip
 
@@ -265,13 +265,8 @@ class Patch(Correction):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content for DIAGNOSIS.json."""
-        return {
-            "kind": self.kind,
-            "port": self.port,
-            "sentence": self.sentence,
-            "evidence": self.evidence,
-            "open_to": list(self.open_to),
-        }
+        names = ("kind", "port", "sentence", "evidence")
+        return {**{n: getattr(self, n) for n in names}, "open_to": list(self.open_to)}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -342,14 +337,15 @@ def best_of(
     return replace(best, open_to=tuple(c.name for c in others))
 
 
-def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> tuple[Patch, ...]:
+def corrections(fit: Fit, colour: Colour) -> tuple[Patch, ...]:
     """Return all corrections of a fit, the one of the highest evidence first."""
+    experiments = fit.experiments
     try:
-        full = fit.predictions(experiments)
+        full = fit.predictions()
         signals = Signals(experiments, [p.displacement for p in full], responses(fit, experiments))
     except PsaError:
         return ()
-    follow = _Following(fit, experiments, colour, [p.jacobian for p in full])
+    follow = _Following(fit, colour, [p.jacobian for p in full])
     fast = shows_ringing(experiments)
     every = [_correction(kind, signals, follow) for kind in KINDS if fast or not kind.fast]
     return tuple(sorted(every, key=lambda c: -c.evidence))
@@ -358,20 +354,14 @@ def corrections(fit: Fit, experiments: Sequence[Experiment], colour: Colour) -> 
 class _Following:
     """The model's parameters, which follow a correction as far as prior and bounds let them."""
 
-    def __init__(
-        self,
-        fit: Fit,
-        experiments: Sequence[Experiment],
-        colour: Colour,
-        jacobians: Sequence[FloatArray],
-    ) -> None:
+    def __init__(self, fit: Fit, colour: Colour, jacobians: Sequence[FloatArray]) -> None:
         self.colour, self.whole, self.residuals = colour, jacobians, fit.residuals
         low, high = fit.unknowns.bounds()
         self.free = (fit.theta > low + _AT_BOUND) & (fit.theta < high - _AT_BOUND)
         known = np.isfinite(fit.unknowns.prior)
         self.prior = np.where(known, fit.unknowns.prior, 1.0)[self.free]
         self.held = np.diag(known[self.free].astype(np.float64))
-        used = np.vstack([j[e.used] for j, e in zip(jacobians, experiments, strict=True)])
+        used = np.vstack([j[e.used] for j, e in zip(jacobians, fit.experiments, strict=True)])
         scaled = used[:, self.free] * self.prior
         self.white = np.vstack([self.over_noise(scaled), self.held])
         self.basis = independent(self.white)
@@ -394,7 +384,7 @@ class _Following:
         return theta
 
 
-def _correction(kind: Kind, signals: Signals, follow: _Following) -> Patch:
+def _correction(kind: Form, signals: Signals, follow: _Following) -> Patch:
     experiments = signals.experiments
     parts = [kind.columns(signals, k) for k in range(len(experiments))]
     shape = kind.shape(parts[0].shape[1])
@@ -472,9 +462,7 @@ def responses(
     return respond
 
 
-def with_patch(
-    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> Fit:
+def with_patch(before: Fit, patch: Patch, predicted: Sequence[FloatArray]) -> Fit:
     """Return a fit with the correction added to the model, started from the correction's weights.
 
     Of two fits, one starts from the model's values as they follow the correction, one from those
@@ -489,7 +477,7 @@ def with_patch(
             f"The unnamed correction ({patch.name}) has no form that a model could hold; the page"
             " shows it, and a further mode of the table is the nearest that can be fitted."
         )
-    numbers = _numbers(before, patch, experiments, predicted)
+    numbers = _numbers(before, patch, predicted)
     names = [patches.weight(k + 1) for k in range(len(patch.weights))]
     values = {**numbers, patches.GAIN: 1.0, **dict(zip(names, patch.weights.tolist(), strict=True))}
 
@@ -497,7 +485,7 @@ def with_patch(
         unknowns = before.unknowns
         return fit(
             before.model.with_effect(component, {**values, **unknowns.values(theta)}),
-            experiments,
+            before.experiments,
             [*unknowns.names, *names],
             sigma=before.sigma,
             start_states=[unknowns.start(theta, r) for r in range(unknowns.records)],
@@ -513,11 +501,9 @@ def with_patch(
     return min(fits, key=lambda f: f.cost)
 
 
-def _numbers(
-    before: Fit, patch: Patch, experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
-) -> Mapping[str, float]:
+def _numbers(before: Fit, patch: Patch, predicted: Sequence[FloatArray]) -> Mapping[str, float]:
     """Return the parameters that are not fitted: the range, times."""
-    records = [e.record for e in experiments]
+    records = [e.record for e in before.experiments]
     longest = max(r.duration for r in records)
     if patch.kind in ("direction", "memory") or patch.port == "drive voltage":
         every = np.concatenate([r.voltage for r in records])
@@ -534,3 +520,108 @@ def _numbers(
             raise InputError("The records span more decades of time than a correction can hold.")
         return {**numbers, "patch_time": float(taus[0]), "patch_ratio": float(taus[1] / taus[0])}
     return numbers
+
+
+#: What a correction of a kind does, where it has another name, and the places of its ports.
+_DOES: dict[str, Kind] = {
+    "curve": "curve", "direction": "hysteresis", "memory": "hysteresis", "relaxation": "relaxation",
+    "modes": "resonance", "time": "time", "gain in time": "changing gain",
+}  # fmt: skip
+_PLACES = {"drive voltage": "drive", "force": "plant", "reading": "sensor"}
+#: The largest probability that is stated.
+SUREST = 0.99
+#: Families less probable than this are not reported.
+_LEAST = 0.01
+
+
+@dataclass(frozen=True)
+class Family:
+    """A place (plant, drive, sensor, environment, or a port of any model) and a kind.
+
+    `probability` is that the cause belongs to it; `effects` are those of the listed effects in it,
+    `not_listed` that it is none of them.
+    """
+
+    place: str
+    kind: str
+    probability: float
+    effects: Mapping[str, float]
+    not_listed: float
+
+
+def place_and_kind(c: Correction) -> tuple[str, str]:
+    """Return the family of an unnamed correction; a free function is a curve at its port."""
+    if isinstance(c, Patch):
+        return _PLACES[c.port], _DOES[c.kind]
+    return c.port, "curve"
+
+
+@dataclass(frozen=True)
+class CauseEvidence:
+    """What a cause has: its evidence E [nats], from n samples, with k causes in all."""
+
+    evidence: float
+    samples: int
+    causes: int = 1
+
+    def listed_probability(self, limits: Thresholds) -> float:
+        """Return the probability that it is of any kind that was tried.
+
+        The odds of what looks like it, but nobody has thought of or is the form of another cause,
+        are `unknown` k (n/E)^(1/2). The smaller it is over the noise, the less of its form shows.
+        """
+        small = float(np.sqrt(self.samples / max(self.evidence, 1e-300)))
+        return 1.0 / (1.0 + limits.unknown * self.causes * small)
+
+
+def families(
+    probability: Mapping[str, float],
+    places: Mapping[str, tuple[str, str]],
+    shown: CauseEvidence,
+    corrections: Sequence[Correction],
+    limits: Thresholds,
+) -> tuple[Family, ...]:
+    """Return the families that a cause may belong to, the most probable first.
+
+    `probability` is that of each effect on condition that the cause is a listed one, `places` has
+    their families; `shown` is the evidence of the cause over the model without it, `corrections`
+    are those of that model. With the evidence F_k, above the price of a cause, of each correction
+    and that E of the cause, the odds that it is not listed are
+
+        sum_k exp((F_k - E*) / T),   T = max(temperature 2, further E)
+
+    over corrections whose kind no likely effect has; E* is E, or F of one of its kind if larger.
+    One of its kind has more freedom: it counts where `enough` of its F is more than E.
+    Without any effect the corrections share all, with `form_of_unnamed` in that place: a model that
+    lacks the cause holds little information on it. One whose kind nobody has declared may be of
+    any. What is missing to 1 is of no kind that was tried (`CauseEvidence.listed_probability`).
+    """
+    evidence = shown.evidence
+    form = limits.further if probability else limits.form_of_unnamed
+    scale = max(limits.temperature, form * evidence)
+    kinds = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
+    apart = [(place_and_kind(c), c.evidence) for c in corrections if c.evidence > limits.price]
+    most = max([evidence, *(e for family, e in apart if family[1] in kinds)])
+    others: dict[tuple[str, str], float] = {}
+    for family, each in apart:
+        if "" not in kinds:
+            ahead = limits.enough * each - evidence if family[1] in kinds else each - most
+            odds = float(np.exp(min(ahead / scale, 50.0)))
+            others[family] = max(others.get(family, 0.0), odds)
+    odds_of_all = bool(probability) + sum(others.values())
+    listed = shown.listed_probability(limits) / odds_of_all if odds_of_all else 0.0
+    table: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
+    for name, p in probability.items():
+        if name in places:
+            table.setdefault(places[name], {})[name] = p * listed
+    rows = (
+        Family(
+            *family,
+            probability=min(SUREST, sum(effects.values()) + others.get(family, 0.0) * listed),
+            effects={n: p for n, p in effects.items() if p > _LEAST},
+            not_listed=others.get(family, 0.0) * listed,
+        )
+        for family, effects in table.items()
+    )
+    probable = (f for f in rows if f.probability > _LEAST)
+    return tuple(sorted(probable, key=lambda f: -f.probability))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from psa_casadi.common.errors import PsaError
+from psa_casadi.common.errors import InputError, PsaError, quoted
 from psa_casadi.common.interruption import interruptible_work
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.progress import Progress, silent
@@ -16,11 +16,11 @@ from psa_casadi.diagnosis.judgement import NAMING, indistinguishable
 from psa_casadi.diagnosis.noise import without_stuck_readings
 from psa_casadi.diagnosis.pack import STACK, Task
 from psa_casadi.diagnosis.probes import laws_of, screened_with
-from psa_casadi.diagnosis.reference import Healthy, Since
+from psa_casadi.diagnosis.reference import Healthy
 from psa_casadi.diagnosis.result import Decision, DiagnosisInterrupted, StackDiagnosis, Verdict
 from psa_casadi.diagnosis.screening import further_gains
 from psa_casadi.diagnosis.search.best_first import best_first
-from psa_casadi.diagnosis.search.steps import Step, steps_of, unsearched
+from psa_casadi.diagnosis.search.state import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.identification.fitting.fit import Fit, fit
@@ -75,10 +75,10 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
 
     `model` is where the base fit started.
     """
-    experiments, progress, limits = task.experiments, task.progress, task.limits
-    if task.fast and explained(base, experiments) < limits.follows:
-        base = from_resonances(base, experiments, progress) or base
-    share = explained(base, experiments)
+    experiments, progress, limits = base.experiments, task.progress, task.limits
+    if task.is_fast(base) and explained(base) < limits.follows:
+        base = from_resonances(base, progress) or base
+    share = explained(base)
     records = [e.record for e in experiments]
     tests = (doubts.doubtful_unit, doubts.doubtful_voltage, doubts.doubtful_time)
     notes = tuple(s for t in (*tests, doubts.doubtful_quantity) if (s := t(records)))
@@ -89,7 +89,7 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     turned = [replace(e, record=r) for e, r in zip(experiments, flipped, strict=True)]
     other, positive = 0.0, max(share, 0.0)
     with suppress(PsaError):
-        other = explained(fit_base(model, turned), turned)
+        other = explained(fit_base(model, turned))
     if other > max(share, limits.follows):
         return Driven(False, (note("flipped", flipped=other, share=positive), *notes))
     if share >= limits.follows:
@@ -101,14 +101,14 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     return Driven(False, (note("not_driven", share=positive), *([quantity] if quantity else [])))
 
 
-def explained(base: Fit, experiments: Sequence[Experiment]) -> float:
+def explained(base: Fit) -> float:
     """Share of the displacements' variance that a fit explains over whole records; 1 is all.
 
     A drift does not count, a parabola over time: a base can make one from its start alone. It does
     where the voltage itself is hardly more than that.
     """
     left = total = 0.0
-    for e, y in zip(experiments, base.predicted(experiments), strict=True):
+    for e, y in zip(base.experiments, base.predicted(), strict=True):
         inputs = measured(e.record)
         valid = np.isfinite(inputs)
         time, v = e.record.time[valid], e.record.voltage[valid]
@@ -154,18 +154,14 @@ _RIVAL = 0.01
 
 
 def column_decisions(
-    steps: Sequence[Step],
-    task: Task,
-    table: Sequence[Component],
-    search: Callable[[Task], Sequence[Step]],
-    verdict: Verdict,
+    steps: Sequence[Step], task: Task, table: Sequence[Component], start: Model, verdict: Verdict
 ) -> tuple[Decision, ...]:
     """Return what every fitted column, and a measured load, decided.
 
-    `table` are all effects, `search` finds the steps of a task, `verdict` is that on `steps`. Each
+    `table` are all effects, the base fit starts at `start`, `verdict` is that on `steps`. Each
     column costs a search.
     """
-    experiments = task.experiments
+    experiments = steps[0].fit.experiments
     columns = [q.column for q in experiments[0].further]
     if is_measured(experiments):
         columns.append(LOAD)
@@ -177,9 +173,9 @@ def column_decisions(
         if column == LOAD:
             effects = tuple(e for e in table if e in effects or e.measured_by == LOAD)
         apart = without_column(experiments, column)
-        alone = Task(apart, effects, STACK, task.method, task.progress, hidden=task.hidden)
+        alone = Task(effects, STACK, task.method, task.progress, hidden=task.hidden)
         now = _named(steps, task.limits) if verdict in NAMING else {}
-        then = _named(search(alone), task.limits)
+        then = _named(_searched(start, apart, alone), task.limits)
         k = next((k for k, f in enumerate(last.fit.further) if f.column == column), None)
         gained = further_gains(first.fit, last.fit, colour).get(column, 0.0)
         by_name = {e.name: e for e in effects}
@@ -261,6 +257,7 @@ def diagnose(
     stiffness: float | None = None,
     hysteresis: Hysteresis | None = None,
     effects: Sequence[Component] | None = None,
+    leave_out: Sequence[str] = (),
     method: Method | None = None,
     progress: Progress = silent,
     watch: Callable[[Tried], None] = lambda _: None,
@@ -277,12 +274,16 @@ def diagnose(
     `reference.Healthy`).
 
     `model` is where the base fit starts; `stiffness` [N/m] fixes the force scale; `hysteresis` is
-    the form of the base's (see `identify`); `effects` is the table to search; `method` can leave
-    parts of the method out (for its ablation). `progress` gets what is done in words, `watch` every
-    hypothesis of the search (`Tried`). Raises InputError, and DiagnosisInterrupted with the best
-    model so far at a keyboard interrupt once there is one.
+    the form of the base's (see `identify`); `effects` is the table to search, without those of the
+    names `leave_out`; `method` can leave parts of the method out (for its ablation). `progress`
+    gets what is done in words, `watch` every hypothesis of the search (`Tried`). Raises InputError,
+    and DiagnosisInterrupted with the best model so far at a keyboard interrupt once there is one.
     """
     method = method or Method()
+    table = tuple(effects if effects is not None else known_effects().values())
+    if unknown := set(leave_out) - {c.name for c in table}:
+        raise InputError(f"`leave_out` has {quoted(sorted(unknown))}, which is no effect.")
+    table = tuple(c for c in table if c.name not in leave_out)
     inputs, kept = records_given(records), records_given(holdout)
     sound, since = records_given(reference), None
     if sound:
@@ -290,27 +291,30 @@ def diagnose(
             sound, model=model, stiffness=stiffness, hysteresis=hysteresis, progress=progress
         )
         progress("what the reference leaves open")
-        since = Healthy(known.fit, known.experiments).since([*inputs, *kept])
+        since = Healthy(known.fit).since([*inputs, *kept])
         inputs, kept = since.taken_off(len(inputs))
         method, model = since.method(method), known.model
     so_far: list[Fit] = []
     with stage("preparing"):
         (whole, cut), (held, cut_too) = without_gaps(inputs), without_gaps(kept)
         ordered = in_one_order(whole)
-        table = tuple(effects if effects is not None else known_effects().values())
-        free = () if since else None
-        task = Task((), table, STACK, method, progress, so_far.append, watch, free=free)
-        start, task, scale_given, notes = _prepared(
+        task = Task(table, STACK, method, progress, so_far.append, watch)
+        start, experiments, task, scale_given, notes = _prepared(
             ordered, in_one_order(held), [*cut, *cut_too], task, model, stiffness, hysteresis
         )
+
+    def diagnosed(method: Method, free: tuple[str, ...] | None) -> StackDiagnosis:
+        changed = replace(task, method=method, free=free)
+        return _diagnose(start, experiments, changed, scale_given)
+
     try:
-        laws = laws_of(start, [e.record for e in task.experiments if e.stop], task.table)
+        laws = laws_of(start, [e.record for e in experiments if e.stop], task.table)
         # from the end: the screening starts at the front
         with compiled_ahead(reversed(screened_with(start, task.table, laws))):
-            result = _against(since, start, task, scale_given)
+            result = since.concluded(method, diagnosed) if since else diagnosed(method, None)
         noise: tuple[NoiseFound, ...] = ()
         if result.verdict != "not_driven":
-            noise = noise_found(result.extended_fit, result.experiments, (*whole, *held))
+            noise = noise_found(result.extended_fit, (*whole, *held))
         return result.with_noise(noise, notes)
     except KeyboardInterrupt:
         if not so_far:
@@ -326,11 +330,11 @@ def _prepared(
     model: Model | None,
     stiffness: float | None,
     hysteresis: Hysteresis | None,
-) -> tuple[Model, Task, bool, list[Note | str]]:
-    """Return where the base fit starts, the task with its experiments, and notes on the records.
+) -> tuple[Model, tuple[Experiment, ...], Task, bool, list[Note | str]]:
+    """Return where the base fit starts, the experiments, the task, and notes on the records.
 
-    And whether the force scale is known; `kept` are records that are held out, `cut` the notes on
-    their gaps. Raises InputError.
+    And, before these, whether the force scale is known; `kept` are records that are held out, `cut`
+    the notes on their gaps. Raises InputError.
     """
     clean, notes, hidden = _cleaned(records)
     notes += cut
@@ -355,8 +359,8 @@ def _prepared(
     start = start.without(c.name for c in searched if c.gain is not None)
     there = {c.name for c in start.components}
     table = (e for e in task.table if set(e.needs) <= there and _recorded(e, experiments))
-    task = replace(task, experiments=experiments, table=tuple(table), hidden=hidden)
-    return start, task, scale_given, notes
+    task = replace(task, table=tuple(table), hidden=hidden)
+    return start, experiments, task, scale_given, notes
 
 
 def _cleaned(records: Sequence[Record]) -> tuple[list[Record], list[Note | str], float]:
@@ -383,32 +387,21 @@ def _on_one_clock(records: Sequence[Record], notes: list[Note | str]) -> list[Re
     return [r for r, _ in done]
 
 
-def _against(since: Since | None, start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
-    """Diagnose what is left of healthy records, where there are any."""
-    if since is None:
-        return _diagnose(start, task, scale_given)
-    return since.concluded(
-        task.method,
-        lambda method, free: _diagnose(start, replace(task, method=method, free=free), scale_given),
-    )
-
-
-def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
+def _diagnose(
+    start: Model, experiments: tuple[Experiment, ...], task: Task, scale_given: bool
+) -> StackDiagnosis:
     """Diagnose from where the base fit starts; the task's `keep` gets the best fit so far."""
-    experiments, table, progress = task.experiments, task.table, task.progress
-    every = table
+    table, progress = task.table, task.progress
     if is_measured(experiments):
-        table = tuple(e for e in table if e.measured_by != LOAD)
+        task = replace(task, table=tuple(e for e in table if e.measured_by != LOAD))
         experiments = loads_as_curves(start, experiments, progress)
-        task = replace(task, table=table, experiments=experiments)
-    base, task = _base(start, task)
-    experiments, stuck = without_stuck_readings(task.experiments, base)
+    base = _base(start, experiments, task)
+    sound, stuck = without_stuck_readings(base)
     if stuck:
-        doubts.refuse_stuck([e.record for e in experiments])
-        base, task = _base(start, replace(task, experiments=experiments))
+        doubts.refuse_stuck([e.record for e in sound])
+        base = _base(start, sound, task)
     read: list[Note] = []
-    base, task = _on_even_clock(base, start, task, read)
-    experiments = task.experiments
+    base = _on_even_clock(base, start, task, read)
     following = driven(base, start, task)
     if not following.follows:
         judge = StackJudge(
@@ -417,69 +410,63 @@ def _diagnose(start: Model, task: Task, scale_given: bool) -> StackDiagnosis:
         result = judge.conclude()
         return replace(result, remarks=(*result.remarks, *following.notes))
     steps = _steps(base, task)
-    fewer, more = without_stuck_readings(experiments, steps[-1].fit)
+    fewer, more = without_stuck_readings(steps[-1].fit)
     if more >= MORE and len(steps) > 1:  # which the misfit of the base had hidden
         stuck += more
-        steps, task = _searched(start, replace(task, experiments=fewer))
-        experiments = task.experiments
-    steps, task = _between_samples(steps, start, task, read)
+        steps = _searched(start, fewer, task)
+    steps = _between_samples(steps, start, task, read)
     progress("judging")
     result = StackJudge(steps, task, scale_given=scale_given).conclude()
-    columns = column_decisions(
-        steps, task, every, lambda other: _searched(start, other)[0], result.verdict
-    )
+    columns = column_decisions(steps, task, table, start, result.verdict)
     read += [note("stuck", count=stuck)] if stuck else []
     turned = [n for f in steps[0].fit.further for n in f.turned]
     remarks = *result.remarks, *following.notes, *read, *turned, *steps[-1].remarks
     return replace(result, columns=columns, remarks=remarks)
 
 
-def _on_even_clock(base: Fit, start: Model, task: Task, notes: list[Note]) -> tuple[Fit, Task]:
+def _on_even_clock(base: Fit, start: Model, task: Task, notes: list[Note]) -> Fit:
     """Fit the base to samples at even times where the data say that the stamps jitter."""
-    even = None if "one clock" in task.method.without else even_clock(base, task.experiments)
+    even = None if "one clock" in task.method.without else even_clock(base)
     if even is not None:
-        again, other = _base(start, replace(task, experiments=even[0]))
+        again = _base(start, even[0], task)
         if again.rms < base.rms:
             notes.append(even[1])
-            return again, other
-    return base, task
+            return again
+    return base
 
 
-def _between_samples(
-    steps: list[Step], start: Model, task: Task, notes: list[Note]
-) -> tuple[list[Step], Task]:
+def _between_samples(steps: list[Step], start: Model, task: Task, notes: list[Note]) -> list[Step]:
     """Search again with a voltage that is smooth between samples where the data say so."""
     between = None
     if "between samples" not in task.method.without:
-        between = smooth_between(steps[0].fit, task.experiments)
+        between = smooth_between(steps[0].fit)
     if between is not None:
-        again, other = _searched(start, replace(task, experiments=between[0]))
+        again = _searched(start, between[0], task)
         if again[0].fit.rms < steps[0].fit.rms:
             notes.append(between[1])
-            return again, other
-    return steps, task
+            return again
+    return steps
 
 
-def _base(start: Model, task: Task) -> tuple[Fit, Task]:
-    """Fit the base model and keep it; return it with the task, further columns at their levels.
+def _base(start: Model, experiments: tuple[Experiment, ...], task: Task) -> Fit:
+    """Fit the base model, further columns at their levels, and keep it.
 
     Raises KeyboardInterrupt after a fit that was interrupted.
     """
     if task.free is None:
-        base = fit_base(start, task.experiments, progress=task.progress)
+        base = fit_base(start, experiments, progress=task.progress)
     else:
-        base = fit(start, task.experiments, task.free, sigma=noise_levels(task.experiments))
-    base, experiments = relevelled(base, task.experiments)
+        base = fit(start, experiments, task.free, sigma=noise_levels(experiments))
+    base = relevelled(base)
     task.keep(base)
     if base.interrupted:
         raise KeyboardInterrupt
-    return base, replace(task, experiments=experiments)
+    return base
 
 
-def _searched(start: Model, task: Task) -> tuple[list[Step], Task]:
-    """Fit the base and search; return the steps, and the task with its columns' levels."""
-    base, task = _base(start, task)
-    return _steps(base, task), task
+def _searched(start: Model, experiments: tuple[Experiment, ...], task: Task) -> list[Step]:
+    """Fit the base and search; return the steps."""
+    return _steps(_base(start, experiments, task), task)
 
 
 def _steps(base: Fit, task: Task) -> list[Step]:

@@ -1,4 +1,4 @@
-"""Errors on held-out samples, the share that each cause removes, and the error budget.
+"""Whether held-out samples confirm a cause; their errors, and the error budget.
 
     share = sum_j (P_before,j - P_after,j) / s_j^2  /  sum_j (P_base,j - s_j^2) / s_j^2
 
@@ -21,10 +21,16 @@ from functools import cached_property
 import numpy as np
 import scipy
 
+from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
-from psa_casadi.diagnosis.colour import Colour, rms
+from psa_casadi.diagnosis.colour import Colour, OwnColour, rms
+from psa_casadi.diagnosis.noise import NoiseFloor, detection_limit_of
+from psa_casadi.diagnosis.task import Thresholds
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.records.split import Experiment, counted
+from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
+from psa_casadi.records.record import FEWEST_SAMPLES
+from psa_casadi.records.split import Experiment, Kind, counted, counts
 
 #: Fewest held-out records that serve as the parts; number of blocks of each that do otherwise.
 FEWEST_RECORDS, _BLOCKS = 4, 8
@@ -158,38 +164,6 @@ def held_out_parts(
     return sums[:, :, 0], counts[:, 0]
 
 
-def gain_of(
-    experiments: Sequence[Experiment], base: Sequence[FloatArray], extended: Sequence[FloatArray]
-) -> Gain:
-    """Return the reduction of the held-out rms, with a jackknife interval of the errors' ratio.
-
-    The interval is that of the ratio's logarithm over the parts of `held_out_parts`.
-    """
-    sums, counts = held_out_parts(experiments, base, extended)
-    records = sum(bool(e.held_out.any()) for e in experiments)
-    centre, half = jackknife(lambda kept: _log_ratio(np.sum(sums[kept], axis=0)), len(counts))
-    gain, low, high = (100.0 * (1.0 - float(np.exp(centre + move))) for move in (0.0, half, -half))
-    return Gain(gain, (low, high), len(counts) if records >= FEWEST_RECORDS else 0)
-
-
-def lost_elsewhere(
-    experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
-    extended: Sequence[FloatArray],
-    inflation: float,
-) -> float:
-    """Return what held-out samples lose, but for the part that gains most [nats].
-
-    That is m ln(E/E_0) over the other parts of `held_out_parts`: m their samples over the noise's
-    `inflation`, E_0 and E the errors' rms. Infinite where there is only one part.
-    """
-    sums, counts = held_out_parts(experiments, base, extended)
-    if len(sums) < 2:
-        return np.inf
-    others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
-    return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
-
-
 def _log_ratio(sums: FloatArray) -> float:
     """Logarithm of the errors' ratio [-], from their sums of squares before and after [m^2]."""
     before, after = (max(float(s), 1e-300) for s in sums)
@@ -244,15 +218,32 @@ class Share:
 
 @dataclass(frozen=True, eq=False)
 class Removed:
-    """What models remove of the held-out error of a `base` above the `noise`.
+    """What models remove of a base's held-out error above the noise, in its first channels.
 
-    `errors_of` turns a model's predictions of all records into its held-out errors (n, outputs) of
-    each, nan where an output is not judged; `noise` (outputs,) is the rms of each output's noise.
+    `base` are its predictions (n, channels), or (n,) of one, of all records; `noise` (outputs,) is
+    the rms of each channel's noise in its unit.
     """
 
-    errors_of: Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
+    experiments: Sequence[Experiment]
     base: Sequence[FloatArray]
     noise: Sequence[float]
+
+    def budget(
+        self,
+        extended: Sequence[FloatArray],
+        without: Sequence[tuple[str, Sequence[FloatArray]]],
+        correction: tuple[str, Sequence[FloatArray]] | None,
+    ) -> "Budget":
+        """Return the budget of an extended model.
+
+        `without` holds the predictions of the model fitted again without each cause, `correction`
+        those with the best unnamed correction.
+        """
+        return Budget(
+            together=self.share("together", self.base, extended),
+            causes=tuple(self.share(name, less, extended) for name, less in without),
+            unnamed=self.share(correction[0], extended, correction[1]) if correction else None,
+        )
 
     def share(self, what: str, before: Sequence[FloatArray], after: Sequence[FloatArray]) -> Share:
         """Return the share of the base's excess that `after` removes of what `before` leaves."""
@@ -265,15 +256,25 @@ class Removed:
         return of(np.ones(count, dtype=bool))
 
     @cached_property
-    def _base_errors(self) -> Sequence[FloatArray]:
-        return self.errors_of(self.base)
+    def _base_errors(self) -> list[FloatArray]:
+        return self._errors(self.base)
+
+    def _errors(self, predicted: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the errors (n, channels) where any channel is judged, else nan."""
+        judged = [counted(self.experiments, j) for j in range(len(self.noise))]
+        parts = []
+        for e, y, *rows in zip(self.experiments, predicted, *judged, strict=True):
+            which, each = np.column_stack(rows), y.reshape(len(y), -1).T
+            left = np.column_stack([e.errors(j, each[j]) for j in range(len(rows))])
+            parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
+        return parts
 
     def _of(
         self, before: Sequence[FloatArray], after: Sequence[FloatArray]
     ) -> tuple[Callable[[BoolArray], float], int]:
         """Return the share over chosen parts, and their number, 0 where there is no excess."""
-        old = self._base_errors if before is self.base else self.errors_of(before)
-        sums, counts = parts_of(self._base_errors, old, self.errors_of(after))
+        old = self._base_errors if before is self.base else self._errors(before)
+        sums, counts = parts_of(self._base_errors, old, self._errors(after))
         floor = np.asarray(self.noise, dtype=np.float64) ** 2
         whole = _powers(sums, counts)[0]
         weights = 1.0 / np.maximum(floor, max(_LEAST_NOISE * float(np.max(whole)), 1e-300))
@@ -324,61 +325,204 @@ class StackBudget(Budget):
     remains_percent: float
 
 
-def removed_from(
-    experiments: Sequence[Experiment], base: Sequence[FloatArray], noise: Sequence[float]
-) -> Removed:
-    """Return what models remove of a base's held-out error in its first channels, one a `noise`.
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """Predictions of a stack by a `base` and an `extended` model [m], of all records."""
 
-    `base` are its predictions (n, channels), or (n,) of one, of all records; `noise` is the rms of
-    each channel's noise in its unit.
-    """
-    judged = [counted(experiments, j) for j in range(len(noise))]
+    experiments: Sequence[Experiment]
+    base: Sequence[FloatArray]
+    extended: Sequence[FloatArray]
 
-    def errors(arrays: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return the errors (n, channels) where any channel is judged, else nan."""
-        parts = []
-        for e, y, *counted_rows in zip(experiments, arrays, *judged, strict=True):
-            which, each = np.column_stack(counted_rows), y.reshape(len(y), -1).T
-            left = np.column_stack([e.errors(j, each[j]) for j in range(len(counted_rows))])
-            parts.append(np.where(which, left, np.nan)[which.any(axis=1)])
-        return parts
+    @cached_property
+    def parts(self) -> tuple[FloatArray, IndexArray]:
+        """The parts of `held_out_parts` for both models."""
+        return held_out_parts(self.experiments, self.base, self.extended)
 
-    return Removed(errors, base, tuple(noise))
+    @property
+    def gain(self) -> Gain:
+        """The reduction of the held-out rms, with a jackknife interval of the errors' ratio.
+
+        The interval is that of the ratio's logarithm over the parts.
+        """
+        sums, counts = self.parts
+        records = sum(bool(e.held_out.any()) for e in self.experiments)
+        centre, half = jackknife(lambda kept: _log_ratio(np.sum(sums[kept], axis=0)), len(counts))
+        moves = (0.0, half, -half)
+        gain, low, high = (100.0 * (1.0 - float(np.exp(centre + move))) for move in moves)
+        return Gain(gain, (low, high), len(counts) if records >= FEWEST_RECORDS else 0)
+
+    def lost_elsewhere(self, inflation: float) -> float:
+        """Return what held-out samples lose, but for the part that gains most [nats].
+
+        That is m ln(E/E_0) over the other parts: m their samples over the noise's `inflation`, E_0
+        and E the errors' rms. Infinite where there is only one part.
+        """
+        sums, counts = self.parts
+        if len(sums) < 2:
+            return np.inf
+        others = np.arange(len(sums)) != int(np.argmax(sums[:, 0] - sums[:, 1]))
+        return float(counts[others].sum()) / inflation * _log_ratio(np.sum(sums[others], axis=0))
+
+    def in_lengths(self, budget: Budget, noise: float) -> StackBudget:
+        """Return the budget of the two models with its lengths, by the rms of the noise [m]."""
+        powers = _powers(*self.parts)
+        excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
+        whole = errors_of(self.experiments, self.extended)
+        percent = whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300)
+        return StackBudget(
+            **vars(budget), excess_rms_m=excess, noise_rms_m=noise, remains_rms_m=remains,
+            remains_percent=percent,
+        )  # fmt: skip
 
 
-def budget(
-    removed: Removed,
-    extended: Sequence[FloatArray],
-    without: Sequence[tuple[str, Sequence[FloatArray]]],
-    correction: tuple[str, Sequence[FloatArray]] | None,
-) -> Budget:
-    """Return the budget of an extended model over a base.
-
-    `without` holds the predictions of the model fitted again without each cause, `correction` those
-    with the best unnamed correction.
-    """
-    return Budget(
-        together=removed.share("together", removed.base, extended),
-        causes=tuple(removed.share(name, less, extended) for name, less in without),
-        unnamed=removed.share(correction[0], extended, correction[1]) if correction else None,
-    )
+#: Gain [%] of an error that doubles.
+_DOUBLED = -100.0
+#: Share of the readings from which on a saturated sensor hides more than it shows.
+_HIDDEN = 0.5
 
 
-def stack_budget(
-    result: Budget,
+def too_few_held_out(experiments: Sequence[Experiment]) -> Note | None:
+    """Return that too few readings are held out to judge a model by; None where enough are."""
+    count = sum(int(e.held_out.sum()) for e in experiments)
+    if count >= FEWEST_SAMPLES:
+        return None
+    return note("few_held_out", count=count, least=FEWEST_SAMPLES)
+
+
+def unconfirmed(
     experiments: Sequence[Experiment],
-    base: Sequence[FloatArray],
-    extended: Sequence[FloatArray],
-    noise: float,
-) -> StackBudget:
-    """Return a budget with its lengths; `base` and `extended` are predictions [m]."""
-    powers = _powers(*held_out_parts(experiments, base, extended))
-    excess, remains = (float(np.sqrt(max(p - noise**2, 0.0))) for p in powers.tolist())
-    whole = errors_of(experiments, extended)
-    return StackBudget(
-        **vars(result),
-        excess_rms_m=excess,
-        noise_rms_m=noise,
-        remains_rms_m=remains,
-        remains_percent=whole.holdout_nrmse_percent * remains / max(whole.holdout_rms_m, 1e-300),
-    )
+    gain: Gain,
+    *,
+    whole: float,
+    lost: float,
+    partly: bool,
+    hidden: float,
+    limits: Thresholds,
+) -> Note | None:
+    """Return why the records do not confirm the causes of an extended model; None where they do.
+
+    `hidden` is the share of the readings that a saturated sensor has made. The interval of the
+    held-out `gain` is uninformative where it reaches from an error that doubles to the `whole` gain
+    [%], which leaves the noise alone; that of a saturation which shows in one of eight parts does
+    too, so that all but the part that gains most must also have `lost` something [nats]. The
+    voltage must be one that stacks bear and, where the causes explain the records `partly` and
+    much remains, the displacement no other quantity.
+    """
+    few = too_few_held_out(experiments)
+    if few is not None:
+        return few
+    if hidden > _HIDDEN:
+        return note("saturated", share=hidden)
+    low, high = gain.interval
+    if low <= _DOUBLED and high >= whole and lost > limits.held_out:
+        return note("gain_unknown", low=low, high=high)
+    records = [e.record for e in experiments]
+    if doubtful_voltage(records):
+        return note("no_such_voltage")
+    if partly and doubtful_quantity(records):
+        return note("other_quantity")
+    return None
+
+
+#: Largest held-out errors that do not count (stray readings), the fewest that are tested, and those
+#: of a whole record: fewer do not determine the colour of its noise.
+_STRAY, _FEWEST, _FEWEST_OF_RECORDS = 2, 50, 512
+
+
+@dataclass(frozen=True)
+class Excess:
+    """By which factor held-out errors exceed what they should be [-], and its p-value."""
+
+    factor: float = 1.0
+    p_value: float = 1.0
+
+    def __bool__(self) -> bool:
+        return self.factor > 1.0
+
+
+def held_out_excess(
+    fit: Fit,
+    predicted: Sequence[FloatArray],
+    colour: OwnColour,
+    noise: Sequence[NoiseFloor],
+    limits: Thresholds,
+) -> Excess:
+    """Return by which factor held-out errors exceed those of the fit; 1 where noise would do so.
+
+    Samples of records that are fitted for the most part are compared with the fitted ones: the
+    innovations by the `colour` of the residual. The ratio F of their mean squares is
+    about normal under noise of kurtosis K, with mean (n + k)/(n - k) for k fitted parameters and n
+    samples of the fit, and variance (K - 1)(1/m + 1/n) for m held-out samples. Whole records that
+    are held out are compared with their `noise`: parameters that the fitted ones leave open
+    make an error there too, so that only a clear excess counts. One below the detection limit of a
+    stack does not.
+    """
+    fitted = [not e.held_out_whole for e in fit.experiments]
+    parts = held_out_residuals(fit.experiments, predicted)
+    beyond = [
+        rms(part) / floor.level
+        for part, floor, mine in zip(parts, noise, fitted, strict=True)
+        if not mine and len(part) >= _FEWEST_OF_RECORDS and floor.level > 0
+    ]
+    excess = held_out_within(colour, len(fit.theta), limits) if all(fitted) else Excess()
+    worst = max(beyond, default=0.0)
+    if worst > max(limits.unseen_ratio_of_records, excess.factor):
+        excess = Excess(worst, limits.unseen_alarm)
+    size = rms(np.concatenate(parts)) * float(np.sqrt(1.0 - 1.0 / excess.factor**2))
+    return excess if size > detection_limit_of(fit, limits) else Excess()
+
+
+def held_out_within(colour: OwnColour, k: int, limits: Thresholds) -> Excess:
+    """Return by which factor innovations exceed those of the fitted samples, k of them spent."""
+    squares = np.sort(colour.ahead**2)[:-_STRAY]
+    learnt = colour.learnt**2
+    n, m, power = len(learnt), len(squares), rms(colour.learnt) ** 2
+    if m < _FEWEST or n <= 2 * k or power <= 0:
+        return Excess()
+    ratio = float(np.mean(squares)) / power
+    kurtosis = max(3.0, float(np.mean(learnt**2)) / power**2)
+    spread = np.sqrt((kurtosis - 1.0) * (1.0 / m + 1.0 / n))
+    chance = float(scipy.special.ndtr(-(ratio * (n - k) / (n + k) - 1.0) / spread))
+    reports = chance < limits.unseen_alarm and ratio > limits.unseen_ratio**2
+    return Excess(float(np.sqrt(ratio)), chance) if reports else Excess()
+
+
+#: Shares of the samples, and of the voltage's span, that are mentioned.
+_SAMPLES, _SPAN = 0.02, 0.01
+
+
+def coverage_notes(experiments: Sequence[Experiment]) -> tuple[Note, ...]:
+    """Return what the held-out figure does not rest on; none where all is covered.
+
+    There may be too few of them. It extrapolates where held-out samples have kinds of stretch that
+    no fitted sample shows, and where their voltage goes beyond the fitted one. It ignores
+    kinds that are not held out.
+    """
+    records = [e.record for e in experiments]
+    voltage = np.concatenate([r.voltage for r in records])
+    span = float(np.ptp(voltage))
+    fitted = counts(records, [e.used for e in experiments], span)
+    held = counts(records, [e.held_out for e in experiments], span)
+    few = too_few_held_out(experiments)
+    if not fitted or few is not None:
+        return () if few is None else (note("held_out_says_little", why=few),)
+    notes = []
+    for code, judged_kinds, known in (
+        ("extrapolates", held, fitted), ("not_held_out", fitted, held),
+    ):  # fmt: skip
+        share, kinds = _without_like(judged_kinds, known)
+        if share > _SAMPLES:
+            notes.append(note(code, share=share, kinds=kinds))
+    used = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    judged = np.concatenate([e.record.voltage[e.held_out] for e in experiments])
+    low, high, least, most = (float(f(v)) for v in (used, judged) for f in (np.min, np.max))
+    if max(low - least, most - high) > _SPAN * span:
+        notes.append(note("voltages_beyond", least=least, most=most, low=low, high=high))
+    return tuple(notes)
+
+
+def _without_like(table: dict[Kind, int], known: dict[Kind, int]) -> tuple[float, tuple[str, ...]]:
+    """Return the share of samples whose kind is not near any `known` one, and the largest kinds."""
+    alone = {k: n for k, n in table.items() if not any(k.near(other) for other in known)}
+    first = sorted(alone, key=lambda k: -alone[k])[:2]
+    return sum(alone.values()) / sum(table.values()), tuple(k.words for k in first)

@@ -10,12 +10,20 @@ import numpy as np
 from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import noise_left, noise_told
-from psa_casadi.diagnosis.confirmation import held_out_within, too_few_held_out
-from psa_casadi.diagnosis.corrections import Correction, FreeFunction, best_of, estimates
-from psa_casadi.diagnosis.families import SUREST, CauseEvidence, Family, families, place_and_kind
+from psa_casadi.diagnosis.corrections import (
+    SUREST,
+    CauseEvidence,
+    Correction,
+    Family,
+    FreeFunction,
+    best_of,
+    estimates,
+    families,
+    place_and_kind,
+)
 from psa_casadi.diagnosis.free_functions import fit_free_functions, formula_of, model_of
-from psa_casadi.diagnosis.generic.attached import Attached
-from psa_casadi.diagnosis.held_out import Budget, Share, budget, removed_from
+from psa_casadi.diagnosis.generic import Attached
+from psa_casadi.diagnosis.held_out import Budget, Removed, Share, held_out_within, too_few_held_out
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import Size, changes
 from psa_casadi.diagnosis.result import (
@@ -29,8 +37,7 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.screening import credible_set, temperature
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, Scale
-from psa_casadi.diagnosis.search.state import SearchState
-from psa_casadi.diagnosis.search.steps import Step, steps_of
+from psa_casadi.diagnosis.search.state import SearchState, Step, steps_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.result import EXCESSIVE
 from psa_casadi.model.component import Component
@@ -83,7 +90,7 @@ class Judge:
     def __init__(self, steps: Sequence[Step], task: Task, *, driven: bool = True) -> None:
         self.steps, self.task, self.driven = tuple(steps), task, driven
         self.first, self.last, self.searched = self.steps[0], self.steps[-1], self.steps[:-1]
-        self.experiments, self.limits = task.experiments, task.limits
+        self.experiments, self.limits = self.first.fit.experiments, task.limits
         self._left: dict[Step, Remaining] = {}
 
     # What depends on the kind of device
@@ -153,7 +160,7 @@ class Judge:
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
         result = self.corrections(before) if beside else ()
-        removed = removed_from(self.experiments, before.predictions, self.noise)
+        removed = Removed(self.experiments, before.predictions, self.noise)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
             f.column: (base**2 - left**2) / (base**2 - floor**2)
@@ -306,8 +313,7 @@ class Judge:
     def budget(self) -> Budget:
         """Where the base's held-out error goes."""
         unnamed = self.reported_correction
-        return budget(
-            removed_from(self.experiments, self.first.view.of.predictions, self.noise),
+        return Removed(self.experiments, self.first.view.of.predictions, self.noise).budget(
             self.final.view.of.predictions,
             [(s.cause.name, s.without.predictions) for s in self.kept if s.without is not None],
             None if unnamed is None else (unnamed.name, unnamed.predicted),
@@ -467,7 +473,7 @@ class ModelJudge(Judge):
     def model(self) -> Model:
         """The extended model, open at the ports that it needs alone."""
         effects = [self.table[s.cause.name] for s in self.kept]
-        return model_of(self.base, self.final.fit, effects, self.experiments)
+        return model_of(self.base, self.final.fit, effects)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Fit free functions added to a hypothesis; none with causes that leave no structure."""
@@ -511,15 +517,15 @@ class ModelJudge(Judge):
         return None
 
     def _noise(self, step: Step) -> tuple[tuple[Experiment, ...], tuple[float, ...]]:
-        return noise_told(step.fit, step.screening.colour, self.experiments)
+        return noise_told(step.fit, step.screening.colour)
 
     @cached_property
     def extended(self) -> tuple[FloatArray, ...]:
         """What the extended model shows of every output along every record (n, ny)."""
-        return tuple(self.final.fit.outputs(self.experiments))
+        return tuple(self.final.fit.outputs())
 
     def _changes(self, effects: Sequence[Component]) -> tuple[Size, ...]:
-        return changes(effects, self.final.fit, self.experiments, self.extended)
+        return changes(effects, self.final.fit, self.extended)
 
     def family(self, effect: Component) -> tuple[str, str]:
         """Return the port and the kind of an effect."""
@@ -582,7 +588,7 @@ class ModelJudge(Judge):
             rms = [missed_rms(self.experiments, p, o.number) for p in both]
             errors.append(OutputError(o.column, o.channel.unit, level, *rms))
         extended = self.extended
-        base = tuple(first.fit.outputs(self.experiments)) if self.kept else extended
+        base = tuple(first.fit.outputs()) if self.kept else extended
         return Diagnosis(
             errors=tuple(errors), remarks=self.remarks, experiments=experiments, base=base,
             extended=extended, **self.common,

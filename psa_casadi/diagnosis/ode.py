@@ -4,7 +4,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,8 +11,7 @@ import numpy as np
 from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.common.notes import Note, note
 from psa_casadi.diagnosis.free_functions import model_of
-from psa_casadi.diagnosis.generic.attached import Attached, of_ones_own
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import Attached, effects_of, of_ones_own
 from psa_casadi.diagnosis.judgement import ModelJudge
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Diagnosis, DiagnosisInterrupted
@@ -22,12 +20,7 @@ from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.moves import fit_rivals
 from psa_casadi.diagnosis.search.state import SearchState
 from psa_casadi.diagnosis.task import Method, Tried
-from psa_casadi.identification.experiments import (
-    column_notes,
-    experiments_of,
-    given_to,
-    undecided,
-)
+from psa_casadi.identification.experiments import column_notes, experiments_of, given_to, undecided
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.inputs import (
     LIKELIER,
@@ -39,7 +32,7 @@ from psa_casadi.identification.inputs import (
     refitted,
 )
 from psa_casadi.identification.multistart import free_of, known_zeros, levelled, refuse_unfit
-from psa_casadi.identification.parts import (
+from psa_casadi.identification.own_model import (
     NEAR,
     Made,
     cut,
@@ -106,7 +99,7 @@ def diagnose_ode(
         return experiments_of(model, *parts, zeros=shifted, known_start=known_start)
 
     known_hold, of_zeros = not undecided(records, hold), [f"zero_of_{n}" for n in shifted]
-    for base, runs, _, choices in ways(
+    for base, _, choices in ways(
         model,
         inputs,
         made,
@@ -117,15 +110,15 @@ def diagnose_ode(
     ):
         if base.interrupted:
             raise KeyboardInterrupt
-        table = _table(base, runs, effects, leave_out, of_zeros)
-        way = _Way(base, runs, choices, table, made, known_hold, progress, watch, [base])
+        table = _table(base, effects, leave_out, of_zeros)
+        way = _Way(base, choices, table, made, known_hold, progress, watch, [base])
         with way.kept_at_interrupt():
             judge, notes = way.searched({c.name for c in effects})
         if _settled(judge):
             break
     with way.kept_at_interrupt():
         answer = judge.conclude()
-    noise = noise_found(answer.extended_fit, answer.experiments, (*inputs, *held))
+    noise = noise_found(answer.extended_fit, (*inputs, *held))
     codes = {n.code for n in notes}
     remarks = (
         *(n for n in way.notes if n.code not in codes),
@@ -167,14 +160,13 @@ def _given(
 
 @dataclass(frozen=True)
 class _Way:
-    """A search from one fit, of whole records or of their parts (`runs`), with `notes`.
+    """A search from one fit, of whole records or of their parts, with `notes`.
 
     `made` returns the whole records; `hold_known` states whether a user has declared what inputs do
     between samples. `so_far` gets every fit that is better than those before it.
     """
 
     base: Fit
-    runs: tuple[Experiment, ...]
     notes: tuple[Note, ...]
     table: Mapping[str, Attached]
     made: Made
@@ -204,33 +196,31 @@ class _Way:
         except KeyboardInterrupt:
             best = self.so_far[-1]
             attached = [self.table[c.name] for c in best.model.effects]
-            model = model_of(self.base.model, best, attached, self.runs, interrupted=True)
+            model = model_of(self.base.model, best, attached, interrupted=True)
             raise DiagnosisInterrupted(model) from None
 
     def _judged(
         self, names: Collection[str], before: SearchState | None = None
     ) -> tuple[ModelJudge, tuple[Note, ...], SearchState]:
-        task_of, notes = partial(self._task, names), tuple[Note, ...]()
+        task, notes = self._task(names), tuple[Note, ...]()
         if before is None:
-            searched, notes = _search(self.base, self.runs, task_of, hold_known=self.hold_known)
+            searched, notes = _search(self.base, task, hold_known=self.hold_known)
         else:
-            searched = best_first(before.base, task_of(before.task.experiments), before)
-            searched.task.keep(searched.answer.fit)
+            searched = best_first(before.base, task, before)
+            task.keep(searched.answer.fit)
         known = searched
-        hold = known.task.experiments[0].record.hold
+        hold = known.base.experiments[0].record.hold
         whole = read_like(self.made(None), hold, self.notes)
-        if len(self.runs) > len(whole):
-            known = _of_whole(known, task_of(whole)) or known
+        if len(self.base.experiments) > len(whole):
+            known = _of_whole(known, whole) or known
         fit_rivals(known)
         self.progress("judging")
         return ModelJudge(known, self.base.model, self.table, whole), notes, searched
 
-    def _task(self, names: Collection[str], experiments: tuple[Experiment, ...]) -> Task:
+    def _task(self, names: Collection[str]) -> Task:
         chosen = tuple(self.table[n].component for n in names)
         method = Method(without=_OF_STACKS)
-        return Task(
-            experiments, chosen, Pack(), method, self.progress, self.so_far.append, self.watch
-        )
+        return Task(chosen, Pack(), method, self.progress, self.so_far.append, self.watch)
 
 
 def _better(new: ModelJudge, old: ModelJudge) -> bool:
@@ -247,9 +237,9 @@ def _better(new: ModelJudge, old: ModelJudge) -> bool:
 def _settled(judge: ModelJudge) -> bool:
     """Whether parts of records would show no more than a search in them."""
     if judge.verdict not in _OPEN:
-        return settled(judge.final.fit, judge.experiments)
-    best = judge.last.fit, judge.experiments
-    return forgets(*best) and (bool(judge.kept) or follows(*best, NEAR))
+        return settled(judge.final.fit)
+    best = judge.last.fit
+    return forgets(best) and (bool(judge.kept) or follows(best, NEAR))
 
 
 def _coloured(judge: ModelJudge) -> bool:
@@ -258,51 +248,43 @@ def _coloured(judge: ModelJudge) -> bool:
     return judge.verdict == "adequate" and any(c.autoregression.size for c in colours)
 
 
-_Tasks = Callable[[tuple[Experiment, ...]], Task]
-
-
-def _search(
-    base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks, *, hold_known: bool
-) -> tuple[SearchState, tuple[Note, ...]]:
+def _search(base: Fit, task: Task, *, hold_known: bool) -> tuple[SearchState, tuple[Note, ...]]:
     """Search from a base fit, and again where the records' noise differs by what it finds.
 
     And with held inputs, if that is likelier and what they do between samples is not known
     (`hold_known`).
     """
-    known = _once(base, experiments, task_of)
-    noise = with_noise(known.answer.fit, experiments)
-    if unlike(noise, experiments):
-        known.task.progress("searching again, noise by record")
-        known = _once(reweighted(base, noise), noise, task_of)
-    other = None if hold_known else _held_instead(known, base, task_of)
+    known = _once(base, task)
+    noise = with_noise(known.answer.fit)
+    if unlike(noise, base.experiments):
+        task.progress("searching again, noise by record")
+        known = _once(reweighted(base, noise), task)
+    other = None if hold_known else _held_instead(known, base)
     return (known, ()) if other is None else other
 
 
-def _once(base: Fit, experiments: tuple[Experiment, ...], task_of: _Tasks) -> SearchState:
+def _once(base: Fit, task: Task) -> SearchState:
     ports = {*ports_of(base.model), *parameter_ports(base.model)}
-    task = task_of(experiments)
     known = best_first(replace(base, model=with_ports(base.model, ports)), task)
     task.keep(known.answer.fit)
     return known
 
 
-def _held_instead(
-    known: SearchState, base: Fit, task_of: _Tasks
-) -> tuple[SearchState, tuple[Note, ...]] | None:
+def _held_instead(known: SearchState, base: Fit) -> tuple[SearchState, tuple[Note, ...]] | None:
     """Return the result with inputs the other way between samples, if that is likelier.
 
     Looked for where the answer is likelier so, or has straight lines that are late by half a
     sampling interval. A cause counts as much as for the choice itself.
     """
-    best, runs, hold = known.answer, known.task.experiments, other_hold(known.task.experiments)
+    best, runs, hold = known.answer, known.base.experiments, other_hold(known.base.experiments)
     step = float(np.median([e.record.sample_time for e in runs]))
     times = [best.fit.model.values[f"{c.name}_time"] for c in best.causes if c.name in _late(base)]
     late = hold == "zero" and any(_HALF[0] < t / step < _HALF[1] for t in times)
-    if not late and not held_otherwise(best.fit, runs):
+    if not late and not held_otherwise(best.fit):
         return None
     others = held_as(runs, hold)
     try:
-        result = _once(refitted(base, others), others, task_of)
+        result = _once(refitted(base, others), known.task)
     except PsaError:
         return None
     nats, more = likelier(result.answer.fit, best.fit), len(result.answer.causes) - len(best.causes)
@@ -316,23 +298,23 @@ def _late(base: Fit) -> set[str]:
     return {f"{kind}_of_{n}" for kind in ("delay", "lag") for n in base.model.input_names}
 
 
-def _of_whole(known: SearchState, task: Task) -> SearchState | None:
-    """Return the results of parts of records as hypotheses of whole ones.
+def _of_whole(known: SearchState, whole: Sequence[Experiment]) -> SearchState | None:
+    """Return the results of parts of records as hypotheses of the `whole` ones.
 
     None where the result does not follow these.
     """
-    best, parts = known.answer, known.task.experiments
-    task.progress("fitting the whole records")
+    best = known.answer
+    known.task.progress("fitting the whole records")
     try:
-        top = fit_longer_parts(best.fit, parts, task.experiments)
-        if not best.causes or not follows(top, task.experiments):
+        top = fit_longer_parts(best.fit, whole)
+        if not best.causes or not follows(top):
             return None
-        base = fit_longer_parts(known.root.fit, parts, task.experiments)
-        result = SearchState(levelled(base, task.experiments)[0], task)
+        base = fit_longer_parts(known.root.fit, whole)
+        result = SearchState(levelled(base), known.task)
         for h in (h for h in known.hypotheses.values() if h.causes and h.final):
             with suppress(PsaError):
-                fit = top if h is best else fit_longer_parts(h.fit, parts, task.experiments)
-                result.note(hypothesis(h.causes, fit, task.experiments, final=True))
+                fit = top if h is best else fit_longer_parts(h.fit, whole)
+                result.note(hypothesis(h.causes, fit, final=True))
         result.conclude()
     except PsaError:
         return None
@@ -340,14 +322,10 @@ def _of_whole(known: SearchState, task: Task) -> SearchState | None:
 
 
 def _table(
-    base: Fit,
-    runs: Sequence[Experiment],
-    effects: Sequence[Component],
-    leave_out: Sequence[str],
-    known: Sequence[str],
+    base: Fit, effects: Sequence[Component], leave_out: Sequence[str], known: Sequence[str]
 ) -> dict[str, Attached]:
     """Return the effects to search at a model's ports, by name, without those that are `known`."""
-    sizes = sizes_of(base.model, runs, base.starts())
+    sizes = sizes_of(base.model, base.experiments, base.starts())
     every = [*effects_of(base.model, sizes), *(of_ones_own(base.model, c) for c in effects)]
     names = [e.name for e in every]
     for name in leave_out:

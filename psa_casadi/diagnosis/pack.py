@@ -8,8 +8,7 @@ import numpy as np
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, noise_rms
-from psa_casadi.diagnosis.noise import detection_limit_of
-from psa_casadi.diagnosis.omnibus import Omnibus, omnibus
+from psa_casadi.diagnosis.noise import Omnibus, detection_limit_of, omnibus
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried, same_curves, shows_ringing
 from psa_casadi.identification.fitting.fit import Fit
@@ -31,8 +30,8 @@ class Pack:
     is_stack = False
 
     def tested(
-        self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
-        colour: Colour, limits: Thresholds, *, own: bool,
+        self, fit: Fit, residuals: Sequence[FloatArray], colour: Colour, limits: Thresholds,
+        *, own: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the residual of every output along every input; the most telling one counts.
 
@@ -42,7 +41,7 @@ class Pack:
         for f, left, noise in zip(fit.channels, residuals, colour.each, strict=True):
             time, inputs = [], []
             for k in f.records:
-                e, at = experiments[k], experiments[k].at(f.number)
+                e, at = fit.experiments[k], fit.experiments[k].at(f.number)
                 time.append((e.record.time - e.record.time[0])[at])
                 inputs.append(record_inputs(fit.model, e.record, e.record.n)[at])
             moving = [column for column in np.vstack(inputs).T if np.ptp(column) > 0]
@@ -67,7 +66,7 @@ class Pack:
         pairs = zip(fit.channels, before.channels, strict=True)
         return any(old.rms**2 - new.rms**2 > new.straight**2 for new, old in pairs)
 
-    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component) -> bool:
         """Return whether the data ask for this effect and not for something else."""
         return cause.is_inside_ranges(fit.model.values)
 
@@ -78,8 +77,8 @@ class StackPack(Pack):
     is_stack = True
 
     def tested(
-        self, fit: Fit, residuals: Sequence[FloatArray], experiments: Sequence[Experiment],
-        colour: Colour, limits: Thresholds, *, own: bool,
+        self, fit: Fit, residuals: Sequence[FloatArray], colour: Colour, limits: Thresholds,
+        *, own: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the displacement's residual, or that of a column where only this one alarms."""
 
@@ -97,8 +96,8 @@ class StackPack(Pack):
                 alarms_below=limits.alarm,
             )  # fmt: skip
 
-        first, *others = residuals
-        test = test_of(first, experiments, colour, detection_limit_of(fit, experiments, limits))
+        experiments, (first, *others) = fit.experiments, residuals
+        test = test_of(first, experiments, colour, detection_limit_of(fit, limits))
         for f, left, of in zip(fit.further, others, colour.further, strict=True):
             if test.alarm:
                 break
@@ -117,7 +116,7 @@ class StackPack(Pack):
         """Return whether the `removed` power [m^2] exceeds that of the limit `least` [m]."""
         return removed > least**2
 
-    def is_admissible(self, fit: Fit, cause: Component, experiments: Sequence[Experiment]) -> bool:
+    def is_admissible(self, fit: Fit, cause: Component) -> bool:
         """Return whether the data ask for this effect and not for something else.
 
         Not with a parameter pushed to the end of its range, a tone among the harmonics of a
@@ -125,12 +124,13 @@ class StackPack(Pack):
         itself rings, or a period over the displacement that fits into it less than twice.
         """
         values, tone, hum = fit.model.values, cause.tone, cause.belongs_to == "environment"
-        widest = max(e.record.range_m for e in experiments)
+        records = [e.record for e in fit.experiments]
+        widest = max(r.range_m for r in records)
         periods = [values[n] for n, grid in cause.probe.items() if grid == DISPLACEMENT_PEAKS]
         if any(period > 0.5 * widest for period in periods):
             return False
         if tone is not None:
-            distinct = all(is_tone_separable(values[tone], e.record, hum=hum) for e in experiments)
+            distinct = all(is_tone_separable(values[tone], r, hum=hum) for r in records)
             if not distinct or (hum and _rings_at(fit, values[tone])):
                 return False
         return cause.is_inside_ranges(values)
@@ -142,14 +142,13 @@ STACK = StackPack()
 
 @dataclass(frozen=True)
 class Task:
-    """The records, the effects to search, what knows the device, the method, and the observers.
+    """The effects to search, what knows the device, the method, and the observers.
 
     `watch` gets every hypothesis of the search, `keep` the best fit so far where a keyboard
     interrupt ends it; `hidden` is the share of the readings that a saturated sensor has made. Of a
     base that is known but for its parameters `free` only these are fitted.
     """
 
-    experiments: tuple[Experiment, ...]
     table: tuple[Component, ...]
     pack: Pack
     method: Method = field(default_factory=Method)
@@ -164,26 +163,23 @@ class Task:
         """The constants that decide."""
         return self.method.thresholds
 
-    @property
-    def fast(self) -> bool:
-        """Whether the device may ring within a record's band."""
-        return self.pack.is_stack and shows_ringing(self.experiments)
+    def is_fast(self, fit: Fit) -> bool:
+        """Whether the device may ring within the band of a record of a fit."""
+        return self.pack.is_stack and shows_ringing(fit.experiments)
 
     def indistinguishable(self, fit: Fit) -> tuple[tuple[str, ...], ...]:
         """Groups of effects that these records cannot separate but by forms nobody knows."""
-        return same_curves(self.experiments, self.table, fit) if self.pack.is_stack else ()
+        return same_curves(self.table, fit) if self.pack.is_stack else ()
 
 
-def is_dynamic(
-    added: Sequence[FloatArray], before: Fit, experiments: Sequence[Experiment], limits: Thresholds
-) -> bool:
+def is_dynamic(added: Sequence[FloatArray], before: Fit, limits: Thresholds) -> bool:
     """Return whether what a memory adds (n,) is more than a curve of a stack's voltage.
 
     At most `static` of the power that the other's parameters cannot follow may be one. Elements
     that are wider than the voltage's way are such a curve.
     """
-    change = np.concatenate([a[e.used] for a, e in zip(added, experiments, strict=True)])
-    voltage = np.concatenate([e.record.voltage[e.used] for e in experiments])
+    change = np.concatenate([a[e.used] for a, e in zip(added, before.experiments, strict=True)])
+    voltage = np.concatenate([e.record.voltage[e.used] for e in before.experiments])
     basis = independent(before.jacobian)
     target = without(change, basis)
     place = (voltage - voltage.min()) / max(float(np.ptp(voltage)), 1e-300)

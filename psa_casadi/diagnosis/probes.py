@@ -51,14 +51,14 @@ _BINS, _FEWEST_PERIODS, _MOST_PERIODS = 2048, 4, 256
 _SIDE = 64
 
 
-def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+def residual_peaks(fit: Fit) -> tuple[float, ...]:
     """Frequencies [Hz] of the highest peaks in the spectrum of the first record's residual.
 
     Samples that do not count are 0, so that a line keeps its phase across them. The range of a
     periodic drive's harmonics is left out, since it may be distortion, but for the mains.
     """
-    record, count = experiments[0].record, experiments[0].stop
-    used = experiments[0].used[:count]
+    first = fit.experiments[0]
+    record, count, used = first.record, first.stop, first.used[: first.stop]
     residual = np.zeros(count)
     residual[used] = fit.residuals[: int(used.sum())]
     residual[used] -= np.mean(residual[used])
@@ -71,12 +71,12 @@ def residual_peaks(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     return tuple(strongest.tolist()) or (0.1 / record.sample_time,)
 
 
-def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+def residual_periods(fit: Fit) -> tuple[float, ...]:
     """Periods [m] with which the residual of the largest record repeats over the displacement.
 
     Of the mean residual in bins of the predicted displacement, under a Hann window.
     """
-    _, span, count, total = _binned(fit, experiments)
+    _, span, count, total = _binned(fit)
     if span <= 0.0:
         return ()
     mean = total / np.maximum(count, 1)
@@ -86,13 +86,13 @@ def residual_periods(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float
     return tuple(np.sort(span * _FINER / order).tolist())
 
 
-def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, ...]:
+def residual_jumps(fit: Fit) -> tuple[float, ...]:
     """Places [m] at which the residual of the largest record jumps over the displacement.
 
     Where the difference of its means on either side is largest over what equal noise would make of
     it; places are displacements of the model, without the record's offset.
     """
-    low, span, count, total = _binned(fit, experiments)
+    low, span, count, total = _binned(fit)
     if span <= 0.0:
         return ()
     below, sums = (np.append(0.0, np.cumsum(q)) for q in (count, total))
@@ -106,16 +106,14 @@ def residual_jumps(fit: Fit, experiments: Sequence[Experiment]) -> tuple[float, 
     return tuple((low + span * np.sort(places) / _BINS).tolist())
 
 
-def _binned(
-    fit: Fit, experiments: Sequence[Experiment]
-) -> tuple[float, float, FloatArray, FloatArray]:
+def _binned(fit: Fit) -> tuple[float, float, FloatArray, FloatArray]:
     """Return lowest displacement and range [m]; samples and sum of the residual in bins of it.
 
     Of the record whose displacement, as the model has it, goes furthest; the residual is about its
     mean.
     """
     parts = []
-    for k, (e, residual) in enumerate(zip(experiments, fit.residuals_of(experiments), strict=True)):
+    for k, (e, residual) in enumerate(zip(fit.experiments, fit.record_residuals, strict=True)):
         if e.held_out_whole:
             continue
         reading = measured(e.record)[: e.stop][e.used[: e.stop]]
@@ -149,30 +147,25 @@ _ROUNDING = 1e-12
 class Direction:
     """One effect at one set of trial values.
 
-    `column` (samples,) [m] is the change of the prediction for the gain `unit_gain` (a derivative
-    times the gain's scale, or a finite step); `values` are the trial values, `memory` the assumed
-    history. `one_sided`: only positive multiples make sense. `further` are the same
-    changes of the further columns, in their units, without what their offsets can follow. `weight`
-    names the parameter that moves, of several that an effect is linear in (see `spans`).
+    `columns` (samples,) are the changes of the prediction of every channel for the gain `unit_gain`
+    (a derivative times the gain's scale, or a finite step), in the channel's unit, without what its
+    offsets can follow; `values` are the trial values, `memory` the assumed history. `one_sided`:
+    only positive multiples make sense. `weight` names the parameter that moves, of several that an
+    effect is linear in (see `spans`).
     """
 
     effect: Component
     values: dict[str, float]
     memory: tuple[dict[str, float], ...]
     unit_gain: float
-    column: FloatArray
+    columns: tuple[FloatArray, ...]
     one_sided: bool
     finite: bool
-    further: tuple[FloatArray, ...] = ()
     weight: str = ""
 
 
 def directions(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    effects: Sequence[Component],
-    *,
-    finite_steps: bool = True,
+    fit: Fit, effects: Sequence[Component], *, finite_steps: bool = True
 ) -> list[Direction]:
     """Return the directions of all effects over their probe values, at the fitted model.
 
@@ -180,47 +173,43 @@ def directions(
     They are simulated side by side.
     """
     grids = [grid for e in effects for grid in e.probe.values()]
-    peaks = {n: of(fit, experiments) for n, of in _FROM_RESIDUAL.items() if n in grids}
-    tasks = [(e, values) for e in effects for values in _probe_values(e, experiments, peaks)]
+    peaks = {n: of(fit) for n, of in _FROM_RESIDUAL.items() if n in grids}
+    tasks = [(e, values) for e in effects for values in _probe_values(e, fit.experiments, peaks)]
     composed = {e.name: fit.model.with_effect(e) for e in effects}
     # else all cores wait for the first one's model, of which there are several tasks
-    fitted = [e.record for e in experiments if e.stop]
+    fitted = [e.record for e in fit.experiments if e.stop]
     laws = laws_of(fit.model, fitted, effects, finite_steps=finite_steps)
     compiled(screened_with(fit.model, effects, laws))
-    others = _Beside(fit, experiments, laws)
+    others = _Beside(fit, laws)
 
     def one(task: tuple[Component, dict[str, float]]) -> list[Direction]:
         effect, values = task
         model = composed[effect.name].with_values(values)
-        return list(_directions_at(fit, experiments, effect, model, values, finite_steps, others))
+        return list(_directions_at(fit, effect, model, values, finite_steps, others))
 
     return [d for result in side_by_side(one, tasks) for d in result]
 
 
-def tangents(
-    fit: Fit, experiments: Sequence[Experiment], effects: Sequence[Component]
-) -> dict[str, tuple[FloatArray, tuple[FloatArray, ...]]]:
+def tangents(fit: Fit, effects: Sequence[Component]) -> dict[str, tuple[FloatArray, ...]]:
     """Return what each of many effects without states changes, for its gain's ordinary size.
 
-    In fitted samples (samples,), and in every further channel. All at once in one model, or along
-    the fit's course, where they have laws; without those that may err by more than `_ROUGH`.
+    In the fitted samples (samples,) of every channel. All at once in one model, or along the fit's
+    course, where they have laws; without those that may err by more than `_ROUGH`.
     """
-    laws = laws_of(fit.model, [e.record for e in experiments if e.stop], effects)
+    laws = laws_of(fit.model, [e.record for e in fit.experiments if e.stop], effects)
     model = fit.model.with_components((*fit.model.components, *effects))
     gains = [e.gain or "" for e in effects]
     sizes = {n: model.parameter(n).typical(model.values) for n in gains}
     memory = tuple(fit.starts())
     if len(laws) < len(effects):
-        columns, further = changes(fit, experiments, model, sizes, memory, 0.0)
-        return {
-            e.name: (columns[:, k], tuple(f[:, k] for f in further)) for k, e in enumerate(effects)
-        }
-    others, table = _Beside(fit, experiments, laws), {}
+        columns, _ = changes(fit, model, sizes, memory, 0.0)
+        return {e.name: tuple(c[:, k] for c in columns) for k, e in enumerate(effects)}
+    others, table = _Beside(fit, laws), {}
     for e, gain in zip(effects, gains, strict=True):
         model, moved = fit.model.with_effect(e), {gain: sizes[gain]}
-        columns, further, error = _changes(fit, experiments, model, moved, memory, 0.0, others)
+        columns, error = changes(fit, model, moved, memory, 0.0, others)
         if error < _ROUGH:
-            table[e.name] = columns[:, 0], tuple(f[:, 0] for f in further)
+            table[e.name] = tuple(c[:, 0] for c in columns)
     return table
 
 
@@ -260,9 +249,8 @@ def screened_with(
 class _Beside:
     """What effects add along the course of a fit, those of the `laws` without a model of theirs."""
 
-    def __init__(
-        self, fit: Fit, experiments: Sequence[Experiment], laws: Mapping[str, tangent.Law]
-    ) -> None:
+    def __init__(self, fit: Fit, laws: Mapping[str, tangent.Law]) -> None:
+        experiments = fit.experiments
         self.laws, self.opened = laws, tangent.opened(fit.model, laws.values())
         self.outputs, starts = outputs_of(experiments[0].channels), fit.starts()
         jacobian = fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
@@ -324,7 +312,6 @@ def _probe_values(
 
 def _directions_at(
     fit: Fit,
-    experiments: Sequence[Experiment],
     effect: Component,
     model: Model,
     values: dict[str, float],
@@ -340,32 +327,28 @@ def _directions_at(
         model = model.with_values(effect.at_gain(0.0, {}))
         moved, steps = {n: model.parameter(n).typical(model.values) for n in effect.linear}, [0.0]
         one_sided = False
-    for memory in _histories(fit, experiments, effect, model):
+    for memory in _histories(fit, effect, model):
         for step in steps:
             try:
-                arguments, clear = (fit, experiments, model, moved, memory, step), False
+                arguments, clear = (fit, model, moved, memory, step), False
                 if effect.name in alongside.laws:
-                    columns, further, error = _changes(*arguments, alongside)
-                    clear = alongside.is_clear(columns, error)
+                    columns, error = changes(*arguments, alongside)
+                    clear = alongside.is_clear(columns[0], error)
                 if not clear:
-                    columns, further = changes(*arguments)
+                    columns, _ = changes(*arguments)
             except PsaError:
                 continue
             for k, (name, size) in enumerate(moved.items()):
-                column, others = columns[:, k], tuple(f[:, k] for f in further)
-                every = np.concatenate([column, *others])
+                each = tuple(c[:, k] for c in columns)
+                every = np.concatenate(each)
                 if not np.all(np.isfinite(every)) or not np.any(every):
                     continue
                 weight, unit = (name, 1.0) if effect.linear else ("", step or size)
                 trial = {**values, name: size} if effect.linear else values
-                yield Direction(
-                    effect, trial, memory, unit, column, one_sided, bool(step), others, weight
-                )
+                yield Direction(effect, trial, memory, unit, each, one_sided, bool(step), weight)
 
 
-def _histories(
-    fit: Fit, experiments: Sequence[Experiment], effect: Component, model: Model
-) -> list[tuple[dict[str, float], ...]]:
+def _histories(fit: Fit, effect: Component, model: Model) -> list[tuple[dict[str, float], ...]]:
     """The effect's memories at rest, and for settling ones also as after long cycling."""
     known = fit.starts()
     if effect.trial_starts:
@@ -374,7 +357,7 @@ def _histories(
     if not settling or not is_stack(model):
         return [tuple(known)]
     cycled = []
-    for memory, e in zip(known, experiments, strict=True):
+    for memory, e in zip(known, fit.experiments, strict=True):
         y = measured(e.record)[e.known]
         cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
     return [tuple(known), tuple(cycled)]
@@ -382,34 +365,20 @@ def _histories(
 
 def changes(
     fit: Fit,
-    experiments: Sequence[Experiment],
-    model: Model,
-    moved: Mapping[str, float],
-    memory: tuple[dict[str, float], ...],
-    step: float,
-) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return what parameters change in the first channel's fitted samples (samples, m).
-
-    In its unit, over the records' shares of the noise. They are `moved` along their derivatives, by
-    their sizes, or the one by a finite `step`. With it comes what each changes in every further
-    channel, beyond offsets and factors.
-    """
-    columns, further, _ = _changes(fit, experiments, model, moved, memory, step)
-    return columns, further
-
-
-def _changes(
-    fit: Fit,
-    experiments: Sequence[Experiment],
     model: Model,
     moved: Mapping[str, float],
     memory: tuple[dict[str, float], ...],
     step: float,
     others: _Beside | None = None,
-) -> tuple[FloatArray, tuple[FloatArray, ...], float]:
-    """Return the same with the share that they may err by, where `others` has the effect's law."""
+) -> tuple[tuple[FloatArray, ...], float]:
+    """Return what parameters change in every channel's fitted samples (samples, m).
+
+    In its unit, over the records' shares of the noise, beyond offsets and factors. They are `moved`
+    along their derivatives, by their sizes, or the one by a finite `step`. With it comes the share
+    that they may err by, where `others` has the effect's law.
+    """
     stepped = model.with_values(dict.fromkeys(moved, step)) if step else model
-    rtol = fit.way.rtol if step else _RTOL
+    experiments, rtol = fit.experiments, fit.way.rtol if step else _RTOL
     rest, sizes = dict.fromkeys(memory_names(stepped.structure), 0.0), np.array([*moved.values()])
 
     def changed(k: int) -> tangent.Answer:
@@ -446,7 +415,7 @@ def _changes(
             else:
                 parts.append(total / e.share(f.number))
         columns.append(f.left_of(np.concatenate(parts)))
-    return columns[0], tuple(columns[1:]), max(a.error for a in every)
+    return tuple(columns), max(a.error for a in every)
 
 
 def spans(trials: Sequence[Direction]) -> list[list[int]]:
@@ -464,16 +433,10 @@ def combined(directions: Sequence[Direction], gains: FloatArray) -> Direction:
     values = {**first.values, **dict.fromkeys(first.effect.linear, 0.0)}
     for d, gain in zip(directions, gains, strict=True):
         values[d.weight] = float(gain) * d.values[d.weight]
-    every = zip(*(d.further for d in directions), strict=True)
+    every = zip(*(d.columns for d in directions), strict=True)
+    columns = tuple(np.column_stack(each) @ gains for each in every)
     return Direction(
-        first.effect,
-        values,
-        first.memory,
-        1.0,
-        np.column_stack([d.column for d in directions]) @ gains,
-        one_sided=False,
-        finite=False,
-        further=tuple(np.column_stack(columns) @ gains for columns in every),
+        first.effect, values, first.memory, 1.0, columns, one_sided=False, finite=False
     )
 
 

@@ -18,8 +18,7 @@ import scipy
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray, rate_unit
-from psa_casadi.diagnosis.colour import Colour, rms
-from psa_casadi.diagnosis.own_colour import Entering, OwnColour, price_of, windows
+from psa_casadi.diagnosis.colour import Colour, Entering, OwnColour, price_of, rms, windows
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.model.component import Expression
 from psa_casadi.model.compose import Model
@@ -73,19 +72,16 @@ class _Noises:
         return _Noises(np.full(power.size, self.place[k]), power.ravel(), time.ravel())
 
 
-def entering(
-    fit: Fit, experiments: Sequence[Experiment], errors: Sequence[FloatArray], k: int,
-    item: OwnColour,
-) -> OwnColour:  # fmt: skip
+def entering(fit: Fit, errors: Sequence[FloatArray], k: int, item: OwnColour) -> OwnColour:
     """Return the noise of channel k with a place where it enters, if that is likelier.
 
-    `errors` (n,) are those of the experiments, over the noise's shares; `item` is the colour that
+    `errors` (n,) are those of whole records, over the noise's shares; `item` is the colour that
     they have by themselves. It is returned as it is where it is white, where nothing is likelier,
     and where the model has no linear form in CasADi's elementary operations.
     """
     if not item.autoregression.size or fit.model.structure.sampled or fit.model.structure.foreign:
         return item
-    number = fit.channels[k].number
+    number, experiments = fit.channels[k].number, fit.experiments
     used = [e.at(number) for e in experiments]
     columns = fit.channels[k].jacobian[:, : 0 if fit.further else None]
     ends = np.cumsum([np.count_nonzero(rows) for rows in used])[:-1]

@@ -91,12 +91,16 @@ class Healthy:
     """What is known of a device from its healthy records: the base `fit` of all their samples."""
 
     fit: Fit
-    experiments: tuple[Experiment, ...]
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The healthy records."""
+        return self.fit.experiments
 
     @cached_property
     def residuals(self) -> list[FloatArray]:
         """Measured minus predicted of every record (n,) [m], about its mean, nan where none."""
-        pairs = zip(self.experiments, self.fit.predicted(self.experiments), strict=True)
+        pairs = zip(self.experiments, self.fit.predicted(), strict=True)
         left = [np.where(e.used, measured(e.record) - y, np.nan) for e, y in pairs]
         return [r - np.nanmean(r) for r in left]
 
@@ -186,7 +190,7 @@ class Healthy:
             self.fit.model, others, self.fit.unknowns.names,
             sigma=noise_levels(others), evaluations=_EVALUATIONS,
         )  # fmt: skip
-        (rest,), _ = Healthy(other, others).since([part]).taken_off(1)
+        (rest,), _ = Healthy(other).since([part]).taken_off(1)
         new = [whole(rest)]
         left = fit(other.model, new, (), sigma=noise_levels(new)).residuals
         (floor,) = noise_floor([rest], [left])

@@ -10,8 +10,7 @@ import numpy as np
 from psa_casadi.common.display import Reported, frame, made, with_units
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.corrections import Correction, Estimate, FreeFunction, Patch
-from psa_casadi.diagnosis.families import Family
+from psa_casadi.diagnosis.corrections import Correction, Estimate, Family, FreeFunction, Patch
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor

@@ -29,6 +29,7 @@ from psa_casadi.diagnosis.colour import Colour, colour_of
 from psa_casadi.diagnosis.probes import Direction, Span, combined, declared, spans
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.fitting.prediction import Further
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 
 _DRAWS = 4000
@@ -94,61 +95,67 @@ class Screening:
 def screen(
     fit: Fit,
     trials: Sequence[Direction],
-    lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
     *,
     colour: Colour | None = None,
     limits: Thresholds = LIMITS,
 ) -> Screening:
-    """Score the directions on a fit's residuals; `lengths` are the records' numbers of samples.
+    """Score the directions on a fit's residuals.
 
     `known` is the colour of the records' noise where it is known without a model; `colour` replaces
     the whole estimate.
     """
-    basis = independent(fit.jacobian)
-    none: FloatArray = np.zeros((len(fit.residuals), 0))
-    columns = np.hstack([none, *(d.column[:, None] for d in trials)])
+    columns = channel_columns(fit, trials)
     if colour is None:
-        every = independent(np.hstack([basis, without(columns, basis)]))
-        colour = colour_of(without(fit.residuals, every), lengths, known, every)
-    arrays = further_columns(fit, trials)
+        lengths = [part.size for part in fit.record_residuals]
+        colour = _unexplained(fit.channels[0], columns[0], lengths, known)
     if not colour.further:
-        colour = replace(colour, further=_further(fit, arrays))
-    white_basis = independent(whitened_jacobian(fit, colour))
-    residual = without(whitened_residuals(fit, colour), white_basis)
-    whole = colour.whiten_all(columns, arrays)
-    white = without(whole, white_basis)
-    norm = np.linalg.norm(white, axis=0)
-    usable = norm > 1e-6 * np.linalg.norm(whole, axis=0)
-    norm = np.where(usable, norm, 1.0)
-    unit = np.where(usable, white / norm, 0.0)
+        rows = zip(fit.further, columns[1:], strict=True)
+        colour = replace(colour, further=tuple(_unexplained(f, c, f.lengths) for f, c in rows))
+    basis = independent(whitened_jacobian(fit, colour))
+    residual = without(whitened_residuals(fit, colour), basis)
+    whole = colour.whiten_all(columns)
+    unit, norms = _unit_vectors(without(whole, basis), whole, _LEFT)
     t = unit.T @ residual / colour.level
     scores, span_places = [], []
     gram = unit.T @ unit
     for places in spans(trials):
         k, direction = places[0], trials[places[0]]
         if direction.weight:
-            size = norm[places] * usable[places] / colour.level
-            span = Span(gram[np.ix_(places, places)], size, limits.false_alarm)
+            sizes = norms[places] / colour.level
+            span = Span(gram[np.ix_(places, places)], sizes, limits.false_alarm)
             span_places.append((places, span))
             scores.append(_of_span([trials[k] for k in places], span, t[places]))
             continue
-        decrease = float(t[k] ** 2) if usable[k] and (t[k] > 0 or not direction.finite) else 0.0
-        gain = float(t[k] * colour.level / norm[k] * direction.unit_gain)
-        least = float(direction.unit_gain * colour.level / norm[k]) if usable[k] else np.inf
+        norm = norms[k] or np.inf
+        decrease = float(t[k] ** 2) if norms[k] and (t[k] > 0 or not direction.finite) else 0.0
+        gain = float(t[k] * colour.level / norm * direction.unit_gain)
+        least = float(direction.unit_gain * colour.level / norm) if norms[k] else np.inf
         scores.append(Score(direction, decrease, gain, least))
     scores.sort(key=lambda s: -s.decrease)
     return Screening(tuple(scores), _threshold(gram, span_places, limits.false_alarm), colour)
 
 
-def _further(fit: Fit, arrays: Sequence[FloatArray]) -> tuple[Colour, ...]:
-    """Return the colours of what neither fit nor directions explain of the further columns."""
-    colours = []
-    for f, more in zip(fit.further, arrays, strict=True):
-        fitted = independent(f.jacobian)
-        every = independent(np.hstack([f.basis, fitted, without(more, fitted)]))
-        colours.append(colour_of(without(f.residuals, every), f.lengths, None, every))
-    return tuple(colours)
+def _unexplained(
+    f: Further, columns: FloatArray, lengths: Sequence[int],
+    known: Sequence[FloatArray | None] | None = None,
+) -> Colour:  # fmt: skip
+    """Return the colour of what neither fit nor directions explain of a channel."""
+    fitted = independent(f.jacobian)
+    every = independent(np.hstack([f.basis, fitted, without(columns, fitted)]))
+    return colour_of(without(f.residuals, every), lengths, known, every)
+
+
+def _unit_vectors(
+    left: FloatArray, whole: FloatArray, least: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the unit vectors of columns (n, k), and their norms (k,).
+
+    Both are 0 for a column of which no more than the share `least` of the `whole` is `left`.
+    """
+    norms = np.linalg.norm(left, axis=0)
+    usable = norms > least * np.linalg.norm(whole, axis=0)
+    return np.where(usable, left / np.where(usable, norms, 1.0), 0.0), norms * usable
 
 
 def _of_span(directions: Sequence[Direction], span: Span, t: FloatArray) -> Score:
@@ -164,19 +171,19 @@ def _of_span(directions: Sequence[Direction], span: Span, t: FloatArray) -> Scor
 
 def whitened_residuals(fit: Fit, colour: Colour) -> FloatArray:
     """Return the whitened residuals (samples,), those of the further columns below."""
-    return colour.whiten_all(fit.residuals, [f.residuals for f in fit.further])
+    return colour.whiten_all([f.residuals for f in fit.channels])
 
 
 def whitened_jacobian(fit: Fit, colour: Colour) -> FloatArray:
     """Return the whitened derivatives by theta (samples, size), the further columns' below."""
-    return colour.whiten_all(fit.jacobian, [f.jacobian for f in fit.further])
+    return colour.whiten_all([f.jacobian for f in fit.channels])
 
 
-def further_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
-    """Return for every further column what the directions change in it (samples, directions)."""
+def channel_columns(fit: Fit, trials: Sequence[Direction]) -> list[FloatArray]:
+    """Return for every channel what the directions change in it (samples, directions)."""
     return [
-        np.hstack([np.zeros((len(f.residuals), 0)), *(d.further[k][:, None] for d in trials)])
-        for k, f in enumerate(fit.further)
+        np.hstack([np.zeros((len(f.residuals), 0)), *(d.columns[k][:, None] for d in trials)])
+        for k, f in enumerate(fit.channels)
     ]
 
 
@@ -194,11 +201,7 @@ class Copy:
 
 
 def copies(
-    fit: Fit,
-    added: FloatArray,
-    trials: Sequence[Direction],
-    colour: Colour,
-    limits: Thresholds,
+    fit: Fit, added: FloatArray, trials: Sequence[Direction], colour: Colour, limits: Thresholds
 ) -> tuple[float, dict[str, Copy]]:
     """Return the power of a contribution over the noise's, and how each effect can copy it.
 
@@ -211,14 +214,12 @@ def copies(
     result: dict[str, Copy] = {}
     for name in dict.fromkeys(d.effect.name for d in trials):
         own = [d for d in trials if d.effect.name == name]
-        columns = np.column_stack([d.column for d in own])
+        columns = np.column_stack([d.columns[0] for d in own])
         free = without(colour.whiten(columns), basis)
-        norms = np.linalg.norm(free, axis=0)
-        usable = norms > 1e-6 * np.linalg.norm(columns, axis=0)
-        if power <= 0 or not usable.any():
+        unit, sizes = _unit_vectors(free, columns, _LEFT)
+        if power <= 0 or not sizes.any():
             continue
-        share = float(np.sum((independent(free[:, usable]).T @ target) ** 2)) / power
-        unit, sizes = np.where(usable, free / np.where(usable, norms, 1.0), 0.0), usable * norms
+        share = float(np.sum((independent(free[:, sizes > 0.0]).T @ target) ** 2)) / power
         along = unit.T @ target / colour.level
         ways = [_copy(own, p, unit, sizes / colour.level, along, limits) for p in spans(own)]
         _, direction, gain = max(ways, key=lambda w: w[0])
@@ -283,8 +284,9 @@ def _threshold(
     return float(np.quantile(largest, 1.0 - false_alarm))
 
 
-#: A direction of which less than this is new besides the fitted parameters is left out.
-_NEW = 1e-4
+#: A direction of which less than this is new besides the fitted parameters is left out: of a set,
+#: and alone.
+_NEW, _LEFT = 1e-4, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,15 +364,11 @@ def best_sets(
     """
     basis = independent(whitened_jacobian(fit, colour))
     residual = without(whitened_residuals(fit, colour), basis)
-    main = np.column_stack([d.column for d in trials])
-    columns = colour.whiten_all(main, further_columns(fit, trials))
-    free = without(columns, basis)
-    norm = np.linalg.norm(free, axis=0)
-    usable = norm > _NEW * np.linalg.norm(columns, axis=0)
-    unit = np.where(usable, free / np.where(usable, norm, 1.0), 0.0)
+    columns = colour.whiten_all(channel_columns(fit, trials))
+    unit, norms = _unit_vectors(without(columns, basis), columns, _NEW)
     gram, along = unit.T @ unit, unit.T @ residual
     positive = np.array([d.one_sided or d.finite for d in trials], dtype=bool)
-    ways, weak, cost = _ways(trials, gram, norm * usable / colour.level, limits)
+    ways, weak, cost = _ways(trials, gram, norms / colour.level, limits)
     gram += np.diag(weak)
     total, n = float(residual @ residual), len(residual)
     sets = []
@@ -387,7 +385,7 @@ def best_sets(
         best = int(np.argmax(decrease))
         share = min(float(decrease[best]) / max(total, 1e-300), 1.0 - 1e-9)
         promise = -0.5 * n * float(np.log1p(-share)) - float(np.sum(cost[index[best]]))
-        multiples = gains[best] / np.maximum(norm[index[best]], 1e-300)
+        multiples = gains[best] / np.maximum(norms[index[best]], 1e-300)
         sets.append(_together(trials, of_each, index[best], multiples, promise))
     heads = {n: group[0] for group in texts for n in group}
     best_of: dict[frozenset[str], Together] = {}
@@ -465,9 +463,7 @@ def estimated(before: Fit, screening: Screening) -> dict[str, float]:
 
 
 def levelled(
-    evidences: Mapping[str, float],
-    texts: Sequence[Sequence[str]],
-    judged: Collection[str] = (),
+    evidences: Mapping[str, float], texts: Sequence[Sequence[str]], judged: Collection[str] = ()
 ) -> dict[str, float]:
     """Return the evidence with that of the best one for all effects that are `texts`.
 

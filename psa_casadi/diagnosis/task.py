@@ -169,9 +169,7 @@ class Tried:
     noise_rms_m: float
 
 
-def same_curves(
-    experiments: Sequence[Experiment], effects: Sequence[Component], fit: Fit
-) -> tuple[tuple[str, ...], ...]:
+def same_curves(effects: Sequence[Component], fit: Fit) -> tuple[tuple[str, ...], ...]:
     """Return groups of effects that bend the same curve, where the records show no resonance.
 
     They show one if a `fit` of them needed a mass and a record is fast enough to see it ring. A
@@ -179,7 +177,7 @@ def same_curves(
     """
     if any(f.column in _TELL_BENDS for f in fit.further):
         return ()
-    rings = shows_ringing(experiments) and any(n in fit.unknowns.names for n in _MASSES)
+    rings = shows_ringing(fit.experiments) and any(n in fit.unknowns.names for n in _MASSES)
     curves = () if rings else sorted({e.curve for e in effects if e.curve is not None})
     groups = (tuple(e.name for e in effects if e.curve == c) for c in curves)
     return tuple(group for group in groups if len(group) > 1)

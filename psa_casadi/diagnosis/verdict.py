@@ -15,11 +15,11 @@ from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.diagnosis import held_out
-from psa_casadi.diagnosis.confirmation import coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.corrections import Correction, corrections, with_patch
+from psa_casadi.diagnosis.held_out import Compared, coverage_notes, held_out_excess, unconfirmed
 from psa_casadi.diagnosis.judgement import Judge, indistinguishable
 from psa_casadi.diagnosis.misfit import FEWEST, Misfit, misfit
-from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor, pooled_level
+from psa_casadi.diagnosis.noise import noise_floor, pooled_level
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.remedy import sizes
 from psa_casadi.diagnosis.result import (
@@ -34,13 +34,12 @@ from psa_casadi.diagnosis.result import (
 )
 from psa_casadi.diagnosis.search.fits import to_end, with_cause
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis
-from psa_casadi.diagnosis.search.steps import Step, contenders
-from psa_casadi.diagnosis.task import Thresholds, same_curves
+from psa_casadi.diagnosis.search.state import Step, contenders
+from psa_casadi.diagnosis.task import same_curves
 from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.identify import with_provenance
-from psa_casadi.model.component import Component
+from psa_casadi.identification.result import evidence_of
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import ErrorBudget, ErrorShare, HeldOut
 from psa_casadi.model.variables import Interval
@@ -50,34 +49,6 @@ from psa_casadi.records.split import Experiment, counts, loop_sizes
 from psa_casadi.simulation.simulate import simulate_record
 from psa_casadi.simulation.start import memory_names
 from psa_casadi.simulation.timings import stage
-
-
-def blind_spots(
-    steps: Sequence[Step], final: Step, table: Sequence[Component], limits: Thresholds
-) -> tuple[BlindSpot, ...]:
-    """Return effects whose smallest gain that shows on these records is more than ordinary.
-
-    Not those that the records do show, fitted with evidence, or as likely as a cause.
-    """
-    spots = []
-    present = {c.name for c in final.fit.model.components}
-    present |= {n for s in steps for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
-    present |= {n for s in steps for n in indistinguishable(s, limits)}
-    factor = np.sqrt(final.screening.threshold)
-    for effect in [e for e in table if e.name not in present]:
-        scores = [s for s in final.screening.scores if s.direction.effect is effect]
-        gain = next(p for p in effect.parameters if p.name == effect.gain)
-        practical = gain.typical(final.fit.model.with_effect(effect, {gain.name: 0.0}).values)
-        smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
-        if smallest > practical:
-            why = note(
-                "blind_spot" if np.isfinite(smallest) else "blind",
-                effect=effect.name, gain=gain.name,
-                smallest=(smallest, gain.unit), ordinary=(practical, gain.unit),
-            )  # fmt: skip
-            spots.append(BlindSpot(effect.name, float(min(smallest, 1e300)), gain.unit, why))
-    return tuple(spots)
-
 
 #: What records need: length of a hold [s]; number of bands, each a factor of four wide, with
 #: durations of the largest rises; number of sizes of loops.
@@ -128,36 +99,6 @@ def useful_records(records: Sequence[Record]) -> Note:
     return note("lacking", what=lacking) if lacking else note("other_conditions")
 
 
-def alternatives(
-    named: Sequence[Step], final: Fit, task: Task, *, stiffness_given: bool
-) -> tuple[Alternative, ...]:
-    """Return, for each cause that may lie on the other side of the sensor, the model with that one.
-
-    Of several such effects the likeliest that can be fitted and simulated.
-    """
-    effects, experiments = {e.name: e for e in task.table}, task.experiments
-    models = []
-    for step in named:
-        for name in sorted(
-            indistinguishable(step, task.limits), key=lambda n: -step.probability.get(n, 0.0)
-        ):
-            if name not in effects or effects[name].in_plant == step.cause.in_plant:
-                continue
-            fitted = _fitted(step, name)
-            if fitted is None:
-                continue
-            try:
-                differs = _difference(final, fitted.fit, experiments)
-            except PsaError:
-                continue
-            model = diagnosed_model(fitted.fit, experiments, fitted.predicted, stiffness_given)
-            models.append(
-                Alternative(step.cause.name, name, model, fitted.fit.rms / final.rms, *differs)
-            )
-            break
-    return tuple(models)
-
-
 def _fitted(step: Step, name: str) -> Hypothesis | None:
     """Return the hypothesis with another effect in a cause's place, fitted to its end."""
     known = step.instead.get(name)
@@ -167,13 +108,13 @@ def _fitted(step: Step, name: str) -> Hypothesis | None:
     return known if known is None or known.final else to_end(known)
 
 
-def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[float, float]:
+def _difference(one: Fit, other: Fit) -> tuple[float, float]:
     """Return by how much the plants of two fits differ on the records: most [m], and % of range.
 
     About the mean difference of each record, as the sensor's zero is free.
     """
     most = span = 0.0
-    for k, e in enumerate(experiments):
+    for k, e in enumerate(one.experiments):
         moved = []
         for fit in (one, other):
             plant = fit.model.plant()
@@ -188,16 +129,15 @@ def _difference(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tupl
 
 def diagnosed_model(
     fit: Fit,
-    experiments: Sequence[Experiment],
     predicted: Sequence[FloatArray],
     stiffness_given: bool,
     spent: held_out.StackBudget | None = None,
 ) -> Model:
     """Return a model of a diagnosis with its evidence; `spent` is its error's budget."""
-    result = determinacy(fit, experiments)
+    result = determinacy(fit)
     evidence = replace(
-        evidence_of(fit, result, experiments, predicted, by="psa diagnose"),
-        held_out=_held_out(experiments, predicted),
+        evidence_of(fit, result, predicted, by="psa diagnose"),
+        held_out=_held_out(fit.experiments, predicted),
         budget=None
         if spent is None
         else ErrorBudget(
@@ -209,7 +149,7 @@ def diagnosed_model(
             unnamed=None if spent.unnamed is None else _share(spent.unnamed),
         ),
     )
-    records = [e.record for e in experiments]
+    records = [e.record for e in fit.experiments]
     return with_provenance(fit.model, result, records, stiffness_given, evidence=evidence)
 
 
@@ -261,13 +201,13 @@ class StackJudge(Judge):
     @cached_property
     def doubt(self) -> Note | None:
         """Why the records do not confirm the causes."""
-        experiments, both = self.experiments, (self.first.predicted, self.last.predicted)
+        compared = Compared(self.experiments, self.first.predicted, self.last.predicted)
         whole = 100.0 * (1.0 - self.floor / max(self.first.view.of.held[0], 1e-300))
         return unconfirmed(
-            experiments,
-            held_out.gain_of(experiments, *both),
+            self.experiments,
+            compared.gain,
             whole=whole,
-            lost=held_out.lost_elsewhere(experiments, *both, self.last.screening.colour.inflation),
+            lost=compared.lost_elsewhere(self.last.screening.colour.inflation),
             partly=self.last.test.alarm and len(self.steps) > 1,
             hidden=self.task.hidden,
             limits=self.limits,
@@ -276,26 +216,29 @@ class StackJudge(Judge):
     @cached_property
     def model(self) -> Model:
         """The extended model, with where its error goes."""
-        final = self.final
-        return diagnosed_model(
-            final.fit, self.experiments, final.predicted, self.scale_given, self.spent
-        )
+        return self._model_of(self.final.view.of, self.spent)
+
+    def _model_of(self, of: Hypothesis, spent: held_out.StackBudget | None = None) -> Model:
+        return diagnosed_model(of.fit, of.predicted, self.scale_given, spent)
 
     @cached_property
     def spent(self) -> held_out.StackBudget:
         """The error budget in lengths."""
-        both = self.first.predicted, self.final.predicted
-        return held_out.stack_budget(self.budget, self.experiments, *both, self.floor)
+        return self.compared.in_lengths(self.budget, self.floor)
+
+    @cached_property
+    def compared(self) -> Compared:
+        """What base and extended model predict of the records."""
+        return Compared(self.experiments, self.first.predicted, self.final.predicted)
 
     def corrections(self, of: Hypothesis) -> Sequence[Correction]:
         """Return the corrections of a hypothesis, by columns at the stack's ports."""
-        return corrections(of.fit, self.experiments, self.last.screening.colour)
+        return corrections(of.fit, self.last.screening.colour)
 
     def held_out_finding(self, step: Step) -> tuple[Note, float] | None:
         """Return by which factor held-out errors exceed those of the fit."""
         excess = held_out_excess(
-            step.fit, self.experiments, step.predicted, step.view.of.colours[0], self.floors,
-            self.limits,
+            step.fit, step.predicted, step.view.of.colours[0], self.floors, self.limits
         )  # fmt: skip
         return (note("held_out_error", factor=excess.factor), excess.p_value) if excess else None
 
@@ -305,14 +248,70 @@ class StackJudge(Judge):
         unit = records[0].displacement_unit
         return self.cause(step, sizes(step.cause, self.model, records, unit=unit))
 
+    def misfits(self, errors: Sequence[FloatArray]) -> tuple[Misfit, ...]:
+        """Return what the errors (n,) of every record show, of those with enough samples."""
+        rows = zip(self.experiments, errors, self.floors, strict=True)
+        enough = [row for row in rows if np.count_nonzero(np.isfinite(row[1])) >= FEWEST]
+        return tuple(misfit(e.record, error, floor) for e, error, floor in enough)
+
+    def blind_spots(self) -> tuple[BlindSpot, ...]:
+        """Return effects whose smallest gain that shows on these records is more than ordinary.
+
+        Not those that the records do show, fitted with evidence, or as likely as a cause.
+        """
+        spots, final, limits = [], self.final, self.limits
+        present = {c.name for c in final.fit.model.components}
+        for s in self.steps:
+            present |= {n for n in s.fitted if s.evidence.get(n, -np.inf) > limits.price}
+            present |= {*indistinguishable(s, limits)}
+        factor = np.sqrt(final.screening.threshold)
+        for effect in [e for e in self.task.table if e.name not in present]:
+            scores = [s for s in final.screening.scores if s.direction.effect is effect]
+            gain = next(p for p in effect.parameters if p.name == effect.gain)
+            practical = gain.typical(final.fit.model.with_effect(effect, {gain.name: 0.0}).values)
+            smallest = min((factor * s.detectable_gain for s in scores), default=np.inf)
+            if smallest > practical:
+                why = note(
+                    "blind_spot" if np.isfinite(smallest) else "blind",
+                    effect=effect.name, gain=gain.name,
+                    smallest=(smallest, gain.unit), ordinary=(practical, gain.unit),
+                )  # fmt: skip
+                spots.append(BlindSpot(effect.name, float(min(smallest, 1e300)), gain.unit, why))
+        return tuple(spots)
+
+    def alternatives(self) -> tuple[Alternative, ...]:
+        """Return, for each cause that may lie on the other side of the sensor, the model with it.
+
+        Of several such effects the likeliest that can be fitted and simulated.
+        """
+        in_plant = {e.name: e.in_plant for e in self.task.table}
+        final, models = self.final.fit, []
+        for step in self.kept:
+            here = step.cause.in_plant
+            rivals = indistinguishable(step, self.limits)
+            others = [n for n in rivals if in_plant.get(n, here) != here]
+            for name in sorted(others, key=lambda n: -step.probability.get(n, 0.0)):
+                other = _fitted(step, name)
+                if other is None:
+                    continue
+                try:
+                    differs = _difference(final, other.fit)
+                except PsaError:
+                    continue
+                model = self._model_of(other)
+                ratio = other.fit.rms / final.rms
+                models.append(Alternative(step.cause.name, name, model, ratio, *differs))
+                break
+        return tuple(models)
+
     @stage("judging")
     def conclude(self) -> StackDiagnosis:
         """Return the diagnosis."""
-        experiments, final, limits = self.experiments, self.final, self.limits
+        experiments, final = self.experiments, self.final
         both = self.first.predicted, final.predicted
-        misfits = _misfits(experiments, self.missed_errors, self.floors)
+        misfits = self.misfits(self.missed_errors)
         records = [e.record for e in experiments]
-        groups = same_curves(experiments, self.task.table, self.first.fit)
+        groups = same_curves(self.task.table, self.first.fit)
         ambiguous = self.verdict == "ambiguous"
         base, extended = (held_out.errors_of(experiments, p) for p in both)
         rms = base.holdout_rms_m, extended.holdout_rms_m
@@ -329,8 +328,8 @@ class StackJudge(Judge):
             noise_floor_rms_m=self.floor,
             base_errors=base,
             extended_errors=extended,
-            gain=held_out.gain_of(experiments, *both),
-            blind_to=blind_spots(self.steps, final, self.task.table, limits),
+            gain=self.compared.gain,
+            blind_to=self.blind_spots(),
             next_experiment=next_experiment(
                 self.causes, self.verdict, groups, records, doubted=self.doubt is not None
             ),
@@ -340,11 +339,9 @@ class StackJudge(Judge):
             extended=both[1],
             noise=self.floors,
             misfit=misfits,
-            remainder=_misfits(experiments, self.errors, self.floors) if self.kept else misfits,
-            contenders=contenders(self.first, limits) if ambiguous else (),
-            alternatives=alternatives(
-                self.kept, final.fit, self.task, stiffness_given=self.scale_given
-            ),
+            remainder=self.misfits(self.errors) if self.kept else misfits,
+            contenders=contenders(self.first, self.limits) if ambiguous else (),
+            alternatives=self.alternatives(),
         )
 
 
@@ -358,16 +355,6 @@ def patched_model(d: Diagnosis) -> Model:
         return d.correction.model
     if not isinstance(d, StackDiagnosis) or d.patch is None:
         raise InputError("No unnamed correction removes more than the extended model does.")
-    fit = with_patch(d.extended_fit, d.patch, d.experiments, d.extended)
+    fit = with_patch(d.extended_fit, d.patch, d.extended)
     inputs = d.model.provenance.force_scale == "given"
-    return diagnosed_model(fit, d.experiments, fit.predicted(d.experiments), inputs)
-
-
-def _misfits(
-    experiments: Sequence[Experiment], errors: Sequence[FloatArray], noise: Sequence[NoiseFloor]
-) -> tuple[Misfit, ...]:
-    return tuple(
-        misfit(e.record, error, floor)
-        for e, error, floor in zip(experiments, errors, noise, strict=True)
-        if np.count_nonzero(np.isfinite(error)) >= FEWEST
-    )
+    return diagnosed_model(fit, fit.predicted(), inputs)

@@ -5,9 +5,9 @@ import json
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from psa_casadi.common.display import Lined
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import Note
 from psa_casadi.common.strict_json import brief, decode, read_json
-from psa_casadi.diagnosis.corrections import Estimate
-from psa_casadi.diagnosis.families import Family
+from psa_casadi.diagnosis.corrections import Estimate, Family
 from psa_casadi.diagnosis.held_out import Budget, Errors, Gain, StackBudget
 from psa_casadi.diagnosis.result import (
     ANY_MODEL,
@@ -35,6 +34,15 @@ from psa_casadi.identification.result import Identification
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.version import __version__
+
+Part = TypeVar("Part")
+
+
+def copied(kind: type[Part], source: Any, /, **others: Any) -> Part:
+    """Return a part of a file: the fields of `source` that have its names, and all `others`."""
+    names = [f.name for f in fields(kind) if f.name not in others]  # type: ignore[arg-type]
+    return kind(**{n: getattr(source, n) for n in names if hasattr(source, n)}, **others)
+
 
 CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
 
@@ -74,11 +82,10 @@ class CheckFile:
 def check_file(report: CheckReport) -> dict[str, Any]:
     """Return what `--json` writes of the checks of an FMU."""
     rows = tuple(
-        CheckedRow(r.name, _finite(r.figure), r.limit, r.passed, r.remark, r.clause, r.noted)
-        for r in report.rows
+        copied(CheckedRow, r, found=_finite(r.figure), allowed=r.limit) for r in report.rows
     )
-    head = (CHECK_FORMAT, __version__, str(report.path))
-    return asdict(CheckFile(*head, report.passed, report.compared, rows, report.left_out))
+    head = {"format": CHECK_FORMAT, "package_version": __version__, "fmu": str(report.path)}
+    return asdict(copied(CheckFile, report, rows=rows, **head))
 
 
 DEVICE_FORMAT: Literal["psa_casadi.device/1"] = "psa_casadi.device/1"
@@ -87,8 +94,8 @@ Status = Literal["done", "refused", "failed"]
 
 
 @dataclass(frozen=True)
-class DeviceRecord:
-    """A record of the device, with the SHA-256 of its file."""
+class RecordUsed:
+    """A record that was used, with the SHA-256 of its file."""
 
     name: str
     sha256: str
@@ -112,7 +119,7 @@ class DeviceFile:
     seconds: float
     key: str
     package_version: str
-    records: tuple[DeviceRecord, ...]
+    records: tuple[RecordUsed, ...]
     files: tuple[str, ...]
     sha256: tuple[str, ...] = ()
 
@@ -254,14 +261,6 @@ class RecordMisfit:
     excess: float
     views: Mapping[str, float]
     sentences: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class RecordUsed:
-    """A record that was diagnosed, with the SHA-256 of its file."""
-
-    name: str
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -451,24 +450,15 @@ def identification_file(
             row = e.record.name, e.record.sha256, len(part), rms, float(sigma), share
             records.append(FittedRecord(*row, channel.column, channel.unit))
     doubts = [d for d in identification.doubts if isinstance(d, Note) and d.code in _MISSED]
-    advice = stack.advice if stack else ()
     misses = [float(d.values[_MISSED[d.code]]) for d in doubts]
-    content = IdentificationFile(
-        format=IDENTIFICATION_FORMAT,
-        package_version=__version__,
-        model=model.name,
-        parameters=parameters,
-        rms_m=fit.rms,
-        converged=fit.converged,
-        interrupted=identification.interrupted,
-        records=tuple(records),
-        warnings=identification.warnings,
-        notes=identification.sentences,
-        advice=tuple(AdvisedRecord(a.sentence, a.parameters, a.repeats) for a in advice),
-        profiles={p.name: ProfileInterval(p.unit, p.estimate, p.low, p.high) for p in profiles},
+    content = copied(
+        IdentificationFile, identification, format=IDENTIFICATION_FORMAT,
+        package_version=__version__, model=model.name, parameters=parameters, rms_m=fit.rms,
+        converged=fit.converged, records=tuple(records), notes=identification.sentences,
+        advice=tuple(copied(AdvisedRecord, a) for a in (stack.advice if stack else ())),
+        profiles={p.name: copied(ProfileInterval, p) for p in profiles},
         missed=max(misses, default=None),
-        noise_kinds=identification.noise_kinds,
-    )
+    )  # fmt: skip
     return asdict(content)
 
 
@@ -537,26 +527,20 @@ def posterior_file(posterior: Posterior) -> dict[str, Any]:
         samples = int(e.at(b.channel).sum())
         row = e.record.name, e.record.sha256, samples, b.correlation_time, b.level
         records.append(SampledRecord(*row, channel.column, channel.unit))
+    known = ("mc_error", "ess", "r_hat", "prior_share")
     parameters = {
-        f.name: SampledParameter(
-            f.unit, f.mean, f.sd, (f.low, f.high), _finite(f.mc_error), _finite(f.ess),
-            _finite(f.r_hat), _finite(f.prior_share), posterior.model.parameter(f.name).description,
+        f.name: copied(
+            SampledParameter, f, interval=(f.low, f.high),
+            meaning=posterior.model.parameter(f.name).description,
+            **{name: _finite(getattr(f, name)) for name in known},
         )
         for f in posterior.figures
     }  # fmt: skip
-    content = PosteriorFile(
-        format=POSTERIOR_FORMAT,
-        package_version=__version__,
-        model=posterior.model.name,
-        parameters=parameters,
-        chains=posterior.chains,
-        draws=posterior.draws,
-        seed=posterior.seed,
-        divergences=posterior.divergences,
-        records=tuple(records),
-        warnings=posterior.warnings,
+    content = copied(
+        PosteriorFile, posterior, format=POSTERIOR_FORMAT, package_version=__version__,
+        model=posterior.model.name, parameters=parameters, records=tuple(records),
         notes=posterior.sentences,
-    )
+    )  # fmt: skip
     return asdict(content)
 
 

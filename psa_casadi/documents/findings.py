@@ -18,7 +18,7 @@ from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import FORMAT as MODEL
 from psa_casadi.model.model_file import model_of
-from psa_casadi.population.finding import (
+from psa_casadi.population.population import (
     BudgetShare,
     Estimate,
     Finding,
@@ -128,11 +128,10 @@ def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
         rms = base.holdout_rms_m, extended.holdout_rms_m, d.noise_floor_rms_m
         errors = [HeldOutErrors(*rms, extended.holdout_nrmse_percent)]
     elif isinstance(d, files.OwnModelFile):
-        errors = [
-            HeldOutErrors(e.base, e.extended, e.noise, output=e.output, unit=e.unit)
-            for e in d.errors
-        ]
-    return Finding(
+        errors = [files.copied(HeldOutErrors, e) for e in d.errors]
+    return files.copied(
+        Finding,
+        d,
         device="",
         kind="diagnosis",
         parameters={
@@ -141,15 +140,12 @@ def _diagnosis(d: files.AnyDiagnosisFile) -> Finding:
             for n, p in c.parameters.items()
         },
         records=tuple((r.name, r.sha256) for r in d.records),
-        verdict=d.verdict,
-        doubt=d.doubt,
         errors=tuple(errors),
         causes=tuple(
             NamedCause(c.effect, c.confidence, c.explained_share, c.cannot_be_told_from)
             for c in d.causes
         ),
-        budget=tuple(BudgetShare(s.what, s.share, s.interval) for s in shares),
-        notes=d.notes,
+        budget=tuple(files.copied(BudgetShare, s) for s in shares),
     )
 
 

@@ -1,43 +1,45 @@
-"""An FMU of another tool with the effects around it, as an SSP that system tools run.
+"""An FMU of another tool with the effects around it, as an SSP or as one FMU.
 
 u -> before (effects of inputs) -> original FMU -> behind (effects of outputs) -> y
+
+The one FMU has the others in its resources, and steps them in turn (fmu_src/nested.c).
 """
 
+import hashlib
 import os
-from collections.abc import Sequence
+import uuid
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
-import casadi as ca
 import numpy as np
+from fmpy import model_description as fmi
 
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_path, temporary_folder
 from psa_casadi.export import ssp
+from psa_casadi.export.common.markup import generation_tool
+from psa_casadi.export.common.templates import filled
 from psa_casadi.export.fmu.archive import write_archive
+from psa_casadi.export.fmu.platforms import compile_library, host_platform
+from psa_casadi.export.fmu.sources import FMI_HEADERS
+from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION
-from psa_casadi.export.importer.played import GIVEN, PLAYED
+from psa_casadi.export.importer.played import GIVEN, PLAYED, RUNS, Passed
 from psa_casadi.export.importer.start_values import FmuPart, fmu_part, start_set
-from psa_casadi.export.nested import nested
-from psa_casadi.model.component import Component, Equations, OnDemand, Symbols
+from psa_casadi.model.component import Component, OnDemand
 from psa_casadi.model.compose import Model
 from psa_casadi.model.ports import Opened, ported
 from psa_casadi.model.variables import Input, Output, State
+from psa_casadi.simulation.compiler import sources_directory
 from psa_casadi.simulation.start import start_for
 
 _BEFORE, _ORIGINAL, _BEHIND = "before", "original", "behind"
 _PARAMETERS = "resources/original.ssv"
-
-
-@dataclass(frozen=True, eq=False)
-class _Passed:
-    """Outputs that are inputs, by name; a state that does nothing, as an FMU needs one."""
-
-    pairs: tuple[tuple[str, str], ...]
-    still: str
-
-    def __call__(self, s: Symbols) -> Equations:
-        return Equations(out={o: getattr(s, i) for o, i in self.pairs}, der={self.still: ca.SX(0)})
 
 
 def export_extended(
@@ -105,7 +107,7 @@ def _by_place(part: FmuPart) -> dict[str, list[Component]]:
         if len(added) != 1 or None in added:
             raise InputError(
                 f"The effect '{effect.name}' acts inside the FMU; only effects at its inputs and"
-                " outputs can stand around it."
+                " outputs can stand around it. `psa simulate --model` runs it, and Python."
             )
         table[str(added.pop())].append(effect)
     return table
@@ -140,7 +142,7 @@ def _wired(part: FmuPart, effects: dict[str, list[Component]]) -> ssp.WiredParts
     names: dict[ssp.Port, str] = {}
     if played is not None:
         ours = [*(i.name for i in inputs), *(o.name for o in outputs)]
-        pairs = zip(ours, (*played.inputs, *played.outputs), strict=True)
+        pairs = zip(ours, (*played.selected.inputs, *played.selected.outputs), strict=True)
         names = {ssp.Port(_ORIGINAL, name): known for name, known in pairs}
     return ssp.WiredParts(model.name, parts, tuple(wires), names=names)
 
@@ -156,7 +158,7 @@ def _side(
         name=name,
         description=f"effects {name} the FMU",
         source=part.component.source,
-        equations=_Passed(pairs, still),
+        equations=Passed(pairs, still),
         states=(State(still, "1", "nothing; an FMU has a state", 1.0),),
         inputs=tuple(inputs),
         outputs=tuple(outputs),
@@ -177,5 +179,153 @@ def _first_outputs(part: FmuPart) -> list[float]:
         return [0.0 for _ in component.outputs]
     stepped = replace(played, interface=CO_SIMULATION)  # as what holds it steps it
     starts = np.array([[i.start for i in component.inputs]])
-    (outputs,) = stepped.outputs_of([(part.model.values, starts)], np.zeros(1), "zero", 1)
+    (outputs,) = RUNS.of([stepped.play(part.model.values, np.zeros(1), starts, "zero")])
     return [float(v) for v in outputs[0]]
+
+
+_IDENTIFIER = "nested"
+#: Kinds of start values in nested_config.h by the type of a variable.
+_KINDS = {"Integer": "I", "Enumeration": "I", "Boolean": "B"}
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """A variable of the FMU: its name, the part and variable that it is, and its start value.
+
+    The token is a hash of the representation of these, name of the class included.
+    """
+
+    name: str
+    part: str
+    variable: str
+    causality: str
+    start: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Nested:
+    """An FMU that holds others, in the order in which they are stepped.
+
+    `starts` are those of the part that is not ours, by the names in it.
+    """
+
+    wiring: ssp.WiredParts
+    archives: Mapping[str, Archive]
+    starts: Mapping[str, float]
+
+    @cached_property
+    def variables(self) -> list[_Shown]:
+        """What is wired outside, and the parameters of every part."""
+        items = []
+        for wire in self.wiring.wires:
+            if wire.start.part == ssp.OUTSIDE:
+                part, inner = wire.end.part, self.wiring.called(wire.end)
+                start = self.archives[part].elements[inner].start
+                items.append(_Shown(wire.start.name, part, inner, "input", start))
+            elif wire.end.part == ssp.OUTSIDE:
+                part, inner = wire.start.part, self.wiring.called(wire.start)
+                items.append(_Shown(wire.end.name, part, inner, "output"))
+        for name, archive in self.archives.items():
+            for v in archive.description.modelVariables:
+                if v.causality == "parameter" and v.type in ("Real", *_KINDS):
+                    start = self.starts.get(v.name, archive.elements[v.name].start)
+                    free = v.name if v.name not in [f.name for f in items] else f"{name}.{v.name}"
+                    items.append(_Shown(free, name, v.name, "parameter", start))
+        wired = {f.variable for f in items if f.causality == "input"}
+        inputs = [n for n in self.archives[_ORIGINAL].names("input") if n not in wired]
+        others = [n for n in inputs if n in self.starts]
+        return items + [_Shown(n, _ORIGINAL, n, "input", self.starts[n]) for n in others]
+
+    def config(self, token: str) -> str:
+        """Return nested_config.h."""
+        order, archives = list(self.archives), self.archives
+
+        def reference(port: ssp.Port) -> int:
+            return archives[port.part].references[self.wiring.called(port)]
+
+        inner = [w for w in self.wiring.wires if ssp.OUTSIDE not in (w.start.part, w.end.part)]
+        ends = [(w.start, w.end) for w in inner]
+        shown, starts = [], []
+        for f in self.variables:
+            shown.append((archives[f.part].references[f.variable], order.index(f.part)))
+            if f.start is not None:
+                kind = _KINDS.get(archives[f.part].elements[f.variable].type, "R")
+                starts.append((*shown[-1], kind, f.start))
+        return filled(
+            "nested_config.h",
+            parts=[(n, a.identifier, a.token, a.takes_lines) for n, a in archives.items()],
+            wires=[(*map(reference, w), *(order.index(p.part) for p in w)) for w in ends],
+            shown=shown,
+            starts=starts,
+            token=token,
+            target=host_platform(),
+        )
+
+    def description(self, token: str) -> bytes:
+        """Return modelDescription.xml, as fmpy writes it."""
+        variables: list[Any] = []
+        for k, f in enumerate(self.variables):
+            of = self.archives[f.part].variables[f.variable]
+            real, start = of.type == "Real", None if f.start is None else repr(f.start)
+            if start is not None and not real:
+                whole = str(round(f.start or 0))
+                start = str(bool(f.start)).lower() if of.type == "Boolean" else whole
+            parameter = f.causality == "parameter"
+            initial = {"parameter": "exact", "output": "calculated"}.get(f.causality)
+            variables.append(
+                fmi.ModelVariable(
+                    name=f.name, valueReference=k, causality=f.causality,
+                    type="Integer" if of.type == "Enumeration" else of.type,
+                    start=start, description=of.description, initial=initial,
+                    variability="fixed" if parameter else "continuous" if real else "discrete",
+                )
+            )  # fmt: skip
+        outputs = [fmi.Unknown(variable=v) for v in variables if v.causality == "output"]
+        original = self.archives[_ORIGINAL]
+        described = fmi.ModelDescription(
+            fmiVersion="2.0", modelName=self.wiring.name, instantiationToken=token,
+            description="an FMU with what was found at its inputs and outputs",
+            generationTool=generation_tool(), variableNamingConvention="flat",
+            defaultExperiment=original.description.defaultExperiment,
+            coSimulation=fmi.CoSimulation(
+                modelIdentifier=_IDENTIFIER,
+                canHandleVariableCommunicationStepSize=all(
+                    a.description.coSimulation.canHandleVariableCommunicationStepSize
+                    for a in self.archives.values()
+                ),
+                canInterpolateInputs=_BEFORE in self.archives or original.takes_lines,
+            ),
+            modelVariables=variables, outputs=outputs, initialUnknowns=outputs,
+        )  # fmt: skip
+        with temporary_folder() as folder:
+            fmi.write_model_description(described, folder / "modelDescription.xml")
+            return (folder / "modelDescription.xml").read_bytes()
+
+
+def nested(
+    wiring: ssp.WiredParts, fmus: Mapping[str, Path], starts: Mapping[str, float]
+) -> dict[str, bytes]:
+    """Return the entries of an FMU that holds others. Raises MachineError if it cannot be compiled.
+
+    `starts` are those of the part that is not ours, by the names in it.
+    """
+    with ExitStack() as held:
+        archives = {n: held.enter_context(Archive(fmus[n])) for n in wiring.parts}
+        whole = _Nested(wiring, archives, starts)
+        contents = (whole.variables, *(f.read_bytes() for f in fmus.values()))
+        digest = hashlib.sha256(repr(contents).encode())
+        token = f"{{{uuid.UUID(digest.hexdigest()[:32])}}}"
+        target = host_platform()
+        headers = files("fmpy") / "c-code"
+        texts = {n: (headers / n).read_text(encoding="utf-8") for n in FMI_HEADERS[2]}
+        texts["nested.c"] = (sources_directory() / "nested.c").read_text(encoding="utf-8")
+        texts["nested_config.h"] = whole.config(token)
+        binary = compile_library(texts, _IDENTIFIER, target)
+        entries = {f"binaries/{target.binaries(2)}/{_IDENTIFIER}{target.suffix}": binary}
+        for name, archive in archives.items():
+            for file in archive.directory.rglob("*"):
+                if file.is_file():
+                    place = file.relative_to(archive.directory).as_posix()
+                    entries[f"resources/{name}/{place}"] = file.read_bytes()
+        entries["modelDescription.xml"] = whole.description(token)
+        return entries

@@ -284,45 +284,6 @@ class Binding:
     mapping: str | None = None
 
 
-def structure_description(
-    wiring: WiredParts,
-    layout: Layout,
-    bindings: Sequence[Binding],
-    stop_time: float,
-    step: float,
-) -> str:
-    """Return the XML text of SystemStructure.ssd; FMUs are `resources/<part>.fmu`.
-
-    SSP 1.0 has no place for a communication step: `step` [s] is in an annotation that
-    OMSimulator reads, and without which it opens no archive. A SystemGeometry is one that it
-    refuses; without it the drawing extends over all elements, as the standard has it.
-    """
-    used = {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)} - {""}
-    names = (name.replace("_", " ") for name in wiring.parts)
-    text = filled(
-        "SystemStructure.ssd",
-        wiring=wiring,
-        layout=layout,
-        bindings=bindings,
-        published={
-            _PUBLISHED.get(name, name): text for name, text in wiring.publication.stated.items()
-        },
-        tool=markup.generation_tool(),
-        about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
-        port=Port,
-        place=_place,
-        describe=markup.describe,
-        wires=list(zip(wiring.wires, layout.paths, strict=True)),
-        step=_decimal(step),
-        tolerance=_decimal(TOLERANCE),
-        units={name: markup.base_unit(parse_unit(name)) for name in sorted(used)},
-        stop_time=markup.number(stop_time),
-        interval=_decimal(stop_time / _ROWS),
-    )
-    check_text(text, "SystemStructure.ssd, an XML file,")
-    return text
-
-
 def _decimal(value: float) -> str:
     """Return a number without exponent."""
     return f"{value:.15f}".rstrip("0")
@@ -330,9 +291,6 @@ def _decimal(value: float) -> str:
 
 def _place(*values: float) -> str:
     return " ".join(f"{round(value, 6):.6g}" for value in values)
-
-
-_FOLDER = "resources"
 
 
 def shared_parameters(parts: Mapping[str, Model]) -> dict[str, tuple[str, ...]]:
@@ -357,18 +315,15 @@ def parameter_files(
     entries: dict[str, str] = {}
     bindings, lifted = [], dict[str, Row]()
     for part, model in parts.items():
-        items = []
-        for row in parameter_rows(model):
-            if part in shared.get(row[0], ()):
-                lifted.setdefault(row[0], row)
-            else:
-                items.append(row)
+        rows = parameter_rows(model)
+        items = [row for row in rows if part not in shared.get(row[0], ())]
+        lifted |= {row[0]: row for row in rows if row not in items and row[0] not in lifted}
         if items:
-            place = f"{_FOLDER}/{part}.ssv"
+            place = f"resources/{part}.ssv"
             entries[place] = set_text(model.name, items)
             bindings.append(Binding(part, place))
     if lifted:
-        values, mapping = f"{_FOLDER}/shared.ssv", f"{_FOLDER}/shared.ssm"
+        values, mapping = "resources/shared.ssv", "resources/shared.ssm"
         entries[values] = set_text(f"{name}_shared", [lifted[n] for n in sorted(lifted)])
         pairs = [(n, f"{part}.{n}") for n in sorted(shared) for part in shared[n]]
         tool = markup.generation_tool()
@@ -380,39 +335,27 @@ def parameter_files(
 #: Growth of a step below which a system counts as stable: memories have the radius 1 itself.
 _GROWTH = 1e-7
 _STEPS_IN_SEARCH = 200
-_BISECTIONS = 40
 
 
 @dataclass(frozen=True)
 class Linear:
-    """All parts at rest, side by side: matrices A, B, C, D and the wires L, u = L y + outside."""
+    """All parts at rest, side by side: x' = A x + B u, and inputs K x at a communication point."""
 
     A: FloatArray
     B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    L: FloatArray
+    K: FloatArray
 
-    def exchange(self) -> FloatArray:
-        """Return K_0, inputs from states at a communication point, shape (nu, nx)."""
-        loop = np.eye(len(self.L)) - self.L @ self.D
-        return np.asarray(np.linalg.solve(loop, self.L @ self.C), dtype=float)
-
-    def step(self, h: float, *, rates: bool) -> FloatArray:
-        """Return M(h) [1], the map of the states over one communication step, shape (nx, nx)."""
+    def growth(self, h: float, *, rates: bool) -> float:
+        """Return the spectral radius of the map of the states over a communication step [s]."""
         nx, nu = self.B.shape
         chain = np.zeros((nx + 2 * nu, nx + 2 * nu))
         chain[:nx, :nx], chain[:nx, nx : nx + nu] = self.A, self.B
         chain[nx : nx + nu, nx + nu :] = np.eye(nu)
-        flow = scipy.linalg.expm(chain * h)
-        K = self.exchange()
-        slopes = K @ (self.A + self.B @ K) if rates else np.zeros((nu, nx))
-        held, sloped = flow[:nx, nx : nx + nu], flow[:nx, nx + nu :]
-        return np.asarray(flow[:nx, :nx] + held @ K + sloped @ slopes)
-
-    def growth(self, h: float, *, rates: bool) -> float:
-        """Return the spectral radius of M(h)."""
-        return float(np.abs(np.linalg.eigvals(self.step(h, rates=rates))).max(initial=0.0))
+        flow = scipy.linalg.expm(chain * h)[:nx]
+        step = flow[:, :nx] + flow[:, nx : nx + nu] @ self.K
+        if rates:
+            step = step + flow[:, nx + nu :] @ self.K @ (self.A + self.B @ self.K)
+        return float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
 
 
 def linear(wiring: WiredParts) -> Linear:
@@ -429,14 +372,14 @@ def linear(wiring: WiredParts) -> Linear:
         a, b, c, d = (np.array(m, dtype=float).reshape(m.shape) for m in result)
         pieces.append((a / size[:, None] * size, b / size[:, None], c * size, d))
     a, b, c, d = (scipy.linalg.block_diag(*(p[k] for p in pieces)) for k in range(4))
-    ends = [(part, n) for part, model in wiring.parts.items() for n in model.input_names]
-    starts = [(part, n) for part, model in wiring.parts.items() for n in model.output_names]
+    ends = [Port(part, n) for part, model in wiring.parts.items() for n in model.input_names]
+    starts = [Port(part, n) for part, model in wiring.parts.items() for n in model.output_names]
     wires = np.zeros((len(ends), len(starts)))
     for wire in wiring.wires:
         if OUTSIDE not in (wire.start.part, wire.end.part):
-            row = ends.index((wire.end.part, wire.end.name))
-            wires[row, starts.index((wire.start.part, wire.start.name))] = 1.0
-    return Linear(a, b, c, d, wires)
+            wires[ends.index(wire.end), starts.index(wire.start)] = 1.0
+    exchange = np.linalg.solve(np.eye(len(wires)) - wires @ d, wires @ c)
+    return Linear(a, b, np.asarray(exchange, dtype=float))
 
 
 def stable_step(wiring: WiredParts, *, rates: bool) -> float:
@@ -446,21 +389,18 @@ def stable_step(wiring: WiredParts, *, rates: bool) -> float:
     the time of the slowest ordinary mode.
     """
     system = linear(wiring)
-    speeds = np.abs(np.linalg.eigvals(system.A + system.B @ system.exchange()))
+    speeds = np.abs(np.linalg.eigvals(system.A + system.B @ system.K))
     speeds = speeds[speeds > 1e-6 * speeds.max(initial=0.0)]
     if not speeds.size:
         return float("inf")
+
+    def excess(step: float) -> float:
+        return system.growth(step, rates=rates) - 1.0 - _GROWTH
+
     steps = np.geomspace(1e-2 / speeds.max(), 1e2 / speeds.min(), _STEPS_IN_SEARCH)
-    for k, step in enumerate(steps):
-        if system.growth(float(step), rates=rates) > 1.0 + _GROWTH:
-            stable, unstable = float(steps[k - 1]) if k else 0.0, float(step)
-            for _ in range(_BISECTIONS):
-                middle = 0.5 * (stable + unstable)
-                if system.growth(middle, rates=rates) > 1.0 + _GROWTH:
-                    unstable = middle
-                else:
-                    stable = middle
-            return stable
+    for stable, unstable in pairwise([0.0, *steps.tolist()]):
+        if excess(unstable) > 0.0:
+            return float(scipy.optimize.bisect(excess, stable, unstable, xtol=1e-12 * unstable))
     return float("inf")
 
 
@@ -519,13 +459,36 @@ def export_ssp(
 def system_entries(
     wiring: WiredParts, bindings: Sequence[Binding], stop_time: float, step: float
 ) -> dict[str, bytes]:
-    """Return the description of a system and the picture of its wiring by place in the archive."""
-    layout = layout_of(wiring)
-    text = structure_description(wiring, layout, bindings, stop_time, step)
-    return {
-        "SystemStructure.ssd": text.encode("utf-8"),
-        PICTURE_ENTRY: wiring_picture(wiring, layout, "svg"),
-    }
+    """Return SystemStructure.ssd and the picture of the wiring by place in the archive.
+
+    FMUs are `resources/<part>.fmu`. SSP 1.0 has no place for a communication step: `step` [s] is in
+    an annotation that OMSimulator reads, and without which it opens no archive. A SystemGeometry is
+    one that it refuses; without it the drawing extends over all elements, as the standard has it.
+    """
+    used = {wiring.unit(port) for wire in wiring.wires for port in (wire.start, wire.end)} - {""}
+    names = (name.replace("_", " ") for name in wiring.parts)
+    layout, stated = layout_of(wiring), wiring.publication.stated
+    text = filled(
+        "SystemStructure.ssd",
+        wiring=wiring,
+        layout=layout,
+        bindings=bindings,
+        published={_PUBLISHED.get(name, name): text for name, text in stated.items()},
+        tool=markup.generation_tool(),
+        about=f"{wiring.name.replace('_', ' ')}: {', '.join(names)}",
+        port=Port,
+        place=_place,
+        describe=markup.describe,
+        wires=list(zip(wiring.wires, layout.paths, strict=True)),
+        step=_decimal(step),
+        tolerance=_decimal(TOLERANCE),
+        units={name: markup.base_unit(parse_unit(name)) for name in sorted(used)},
+        stop_time=markup.number(stop_time),
+        interval=_decimal(stop_time / _ROWS),
+    )
+    check_text(text, "SystemStructure.ssd, an XML file,")
+    picture = wiring_picture(wiring, layout, "svg")
+    return {"SystemStructure.ssd": text.encode("utf-8"), PICTURE_ENTRY: picture}
 
 
 def part_fmu(model: Model, name: str, folder: Path, platforms: Sequence[str]) -> Path:

@@ -23,7 +23,6 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.excitation import decaying_triangle, multisine, sine, time_grid
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import settling_time
 
@@ -222,11 +221,7 @@ class Advice(Worded):
 
 
 def advice(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    determinacy: Determinacy,
-    *,
-    force_scale_given: bool = False,
+    fit: Fit, determinacy: Determinacy, *, force_scale_given: bool = False
 ) -> tuple[Advice, ...]:
     """Return further records that would determine what is open, the shortest first.
 
@@ -239,14 +234,14 @@ def advice(
     determine much come before others, those that need no faster sampling than the records at hand
     before others. What no single one determines may need several, or repeats.
     """
-    return _Adviser(fit, experiments, determinacy).all(force_scale_given)
+    return _Adviser(fit, determinacy).all(force_scale_given)
 
 
 class _Adviser:
     """The information at hand and in every plan, for the fit's parameters and the fixed lags."""
 
-    def __init__(self, fit: Fit, experiments: Sequence[Experiment], of: Determinacy) -> None:
-        self._fit, self._determinacy, self._experiments = fit, of, experiments
+    def __init__(self, fit: Fit, of: Determinacy) -> None:
+        self._fit, self._determinacy, self._experiments = fit, of, fit.experiments
         extra = [n for n in SEARCHABLE if n in fit.model.values and n not in of.names]
         self._names = (*of.names, *extra)
         self._noise = max(fit.rms, min(fit.sigma))

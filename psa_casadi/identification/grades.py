@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal, get_args
 
-from psa_casadi.identification.determinacy import DETERMINED_WIDTH, NORMAL_95
+from psa_casadi.identification.determinacy import DETERMINED_WIDTH
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import NORMAL_95
 
 Degree = Literal["determined", "weak", "undetermined", "on its bound", "fixed"]
 DEGREES: tuple[Degree, ...] = get_args(Degree)

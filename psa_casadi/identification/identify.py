@@ -10,9 +10,13 @@ from psa_casadi.common.interruption import current_work, interruptible_work
 from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.advice import Advice, advice
-from psa_casadi.identification.combinations import Combination, free_combinations
-from psa_casadi.identification.determinacy import Determinacy, assumed_ratio, determinacy
-from psa_casadi.identification.evidence import evidence_of
+from psa_casadi.identification.determinacy import (
+    Combination,
+    Determinacy,
+    assumed_ratio,
+    determinacy,
+    free_combinations,
+)
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.inputs import even_clock
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
@@ -21,19 +25,12 @@ from psa_casadi.identification.result import (
     EXCESSIVE,
     Identification,
     doubts_of,
+    evidence_of,
     noise_found,
     with_origin,
 )
 from psa_casadi.identification.search import loads_as_curves, search_forms
-from psa_casadi.identification.start.doubts import (
-    doubtful_quantity,
-    doubtful_sign,
-    doubtful_time,
-    doubtful_unit,
-    doubtful_voltage,
-    refuse_few,
-    refuse_unreadable,
-)
+from psa_casadi.identification.start.doubts import doubtful, refuse_few, refuse_unreadable
 from psa_casadi.identification.start.ordinary import (
     Hysteresis,
     capacitance_of,
@@ -47,14 +44,11 @@ from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, excerpts, whole, without_gaps
+from psa_casadi.records.split import excerpts, whole, without_gaps
 from psa_casadi.simulation.side_by_side import one_thread_of_algebra
 
 #: Rounds of fitting with every record's residual as its noise level.
 _LEVEL_ROUNDS = 2
-
-#: What may be unlike a stack's in records.
-_DOUBTS = (doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity)
 
 FORCE_NOTE = note("force_assumed")
 INTERRUPTED = note("interrupted")
@@ -121,48 +115,37 @@ def identify(
     result, preferred = search_forms(
         forms, experiments, linear=linear, thorough=True, progress=progress
     )
-    best, experiments = _on_even_clock(*relevelled(result.best, experiments), notes)
-    best = _with_record_levels(best, experiments, progress)
+    best = _on_even_clock(relevelled(result.best), notes)
+    best = _with_record_levels(best, progress)
     if best.interrupted:
         current_work().wrap_up()
-    determined = determinacy(
-        best, experiments, not_unique=result.not_unique, assumed=assumed_ratio(best, experiments)
-    )
+    determined = determinacy(best, not_unique=result.not_unique, assumed=assumed_ratio(best))
     open_ones = free_combinations(best.model, determined, force_scale_given=inputs)
     advised: tuple[Advice, ...] | None = None
     evidence: Evidence | None = None
     noise: tuple[NoiseFound, ...] = ()
     if not best.interrupted:
         try:
+            sampled = [known[r.sha256] for r in fitted]
             evidence = evidence_of(
-                best,
-                determined,
-                experiments,
-                best.predicted(experiments),
-                by="psa identify",
-                sampled=[known[r.sha256] for r in fitted],
+                best, determined, best.predicted(), by="psa identify", sampled=sampled
             )
-            noise = noise_found(best, experiments, parts)
+            noise = noise_found(best, parts)
             progress("what further records would tell")
-            advised = advice(best, experiments, determined, force_scale_given=inputs)
+            advised = advice(best, determined, force_scale_given=inputs)
         except KeyboardInterrupt:
             current_work().wrap_up()
     return StackIdentification(
         model=with_provenance(
-            best.model,
-            determined,
-            given_records,
-            inputs,
-            interrupted=best.interrupted,
-            evidence=evidence,
+            best.model, determined, given_records, inputs,
+            interrupted=best.interrupted, evidence=evidence,
         ),
         fit=best,
         determinacy=determined,
-        experiments=experiments,
         doubts=(
-            *(s for doubt in _DOUBTS if (s := doubt(fitted))),
+            *doubtful(fitted),
             *doubts_of(best, determined, result.starts, result.not_unique),
-            *_excess_notes(best, experiments),
+            *_excess_notes(best),
         ),
         starts=result.starts,
         notes=(
@@ -176,7 +159,7 @@ def identify(
         advice=advised or (),
         interrupted=advised is None,
         noise_kinds=noise,
-    )
+    )  # fmt: skip
 
 
 def with_provenance(
@@ -218,41 +201,39 @@ def unfinished(best: Fit, records: Sequence[Record], stiffness_given: bool) -> M
     )  # fmt: skip
 
 
-def _on_even_clock(
-    best: Fit, experiments: tuple[Experiment, ...], notes: list[Note | str]
-) -> tuple[Fit, tuple[Experiment, ...]]:
+def _on_even_clock(best: Fit, notes: list[Note | str]) -> Fit:
     """Fit samples at even times where the data say that the stamps jitter."""
-    even = None if best.interrupted else even_clock(best, experiments)
+    even = None if best.interrupted else even_clock(best)
     if even is not None:
-        again = refit(best, even[0])
+        again = refit(best, others=even[0])
         if again.rms < best.rms:
             notes.append(even[1])
-            return again, even[0]
-    return best, experiments
+            return again
+    return best
 
 
-def _with_record_levels(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def _with_record_levels(best: Fit, progress: Progress) -> Fit:
     """Fit again with every record's residual as its noise level: its maximum-likelihood estimate.
 
     One record alone needs no second fit, since a common factor moves nothing but the weak priors.
     """
-    for _ in range(_LEVEL_ROUNDS if len(experiments) > 1 else 0):
-        levels = record_rms(best, experiments)
+    for _ in range(_LEVEL_ROUNDS if len(best.experiments) > 1 else 0):
+        levels = record_rms(best)
         change = np.max(np.abs(np.log(np.array(levels) / np.array(best.sigma))))
         if best.interrupted or change < 0.02:
             break
         progress("base fit with every record's own noise level")
         try:
-            best = refit(best, experiments, sigma=levels)
+            best = refit(best, sigma=levels)
         except KeyboardInterrupt:
             return replace(best, interrupted=True, converged=False)
     return best
 
 
-def _excess_notes(best: Fit, experiments: Sequence[Experiment]) -> list[Note]:
+def _excess_notes(best: Fit) -> list[Note]:
     """Return notes on the records whose residual exceeds their noise."""
     notes = []
-    for e, residual in zip(experiments, best.residuals_of(experiments), strict=True):
+    for e, residual in zip(best.experiments, best.record_residuals, strict=True):
         if len(residual) < 8:
             continue
         rms, noise = float(np.sqrt(np.mean(residual**2))), high_frequency_noise(residual)

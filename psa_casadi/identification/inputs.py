@@ -42,21 +42,19 @@ _ORDER = 8
 _NOISY, _MOVING = 0.005, 0.3
 
 
-def read_otherwise(
-    of: Fit, experiments: Sequence[Experiment], *, undecided: bool
-) -> tuple[Fit, tuple[Experiment, ...], tuple[Note, ...]]:
-    """Return the fit with the likeliest reading of the inputs, its experiments, and notes on it.
+def read_otherwise(of: Fit, *, undecided: bool) -> tuple[Fit, tuple[Note, ...]]:
+    """Return the fit with the likeliest reading of the inputs, and notes on it.
 
     Held or straight lines between samples, if that is `undecided`; then straight lines through
     noisy readings, or through smoothed ones. The same fit if it was interrupted.
     """
-    best, read, notes = of, tuple(experiments), list[Note]()
+    best, notes = of, list[Note]()
     changes = (held_otherwise, _smoothed_instead) if undecided else (_smoothed_instead,)
     for change in () if of.interrupted else changes:
-        if other := change(best, read):
-            best, read, why = other
+        if other := change(best):
+            best, why = other
             notes.append(why)
-    return best, read, tuple(notes)
+    return best, tuple(notes)
 
 
 def read_like(
@@ -67,15 +65,13 @@ def read_like(
     return tuple(_smoothed(e, names)[0] for e in held_as(experiments, hold))
 
 
-def _smoothed_instead(
-    of: Fit, experiments: Sequence[Experiment]
-) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
+def _smoothed_instead(of: Fit) -> tuple[Fit, Note] | None:
     """Return the fit with noisy inputs smoothed, where that is `LIKELIER`.
 
     Noise that is read at an input passes through the model: it adds to the residual, and bends the
     parameters (errors in variables).
     """
-    pairs = [_smoothed(e, of.model.input_names) for e in experiments]
+    pairs = [_smoothed(e, of.model.input_names) for e in of.experiments]
     noisy = tuple(dict.fromkeys(n for _, names in pairs for n in names))
     if not noisy:
         return None
@@ -102,20 +98,18 @@ def _smoothed(e: Experiment, names: Sequence[str]) -> tuple[Experiment, list[str
     return replace(e, record=replace(signals, columns={**signals.columns, **noisy})), [*noisy]
 
 
-def held_otherwise(
-    of: Fit, experiments: Sequence[Experiment]
-) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
+def held_otherwise(of: Fit) -> tuple[Fit, Note] | None:
     """Return the fit with inputs the other way between samples, where that is `LIKELIER`.
 
     All inputs of all records are held, or none is.
     """
-    hold = other_hold(experiments)
-    return _instead(of, held_as(experiments, hold), "hold_found", hold=hold)
+    hold = other_hold(of.experiments)
+    return _instead(of, held_as(of.experiments, hold), "hold_found", hold=hold)
 
 
 def _instead(
     of: Fit, others: Sequence[Experiment], code: str, **values: Any
-) -> tuple[Fit, tuple[Experiment, ...], Note] | None:
+) -> tuple[Fit, Note] | None:
     """Return the fit of other experiments and its note, where it is `LIKELIER`."""
     try:
         fit = refitted(of, others)
@@ -124,8 +118,7 @@ def _instead(
     nats = likelier(fit, of)
     if nats < LIKELIER:
         return None
-    best, again = relevelled(fit, others, every=True)
-    return best, again, note(code, **values, nats=nats)
+    return relevelled(fit, every=True), note(code, **values, nats=nats)
 
 
 def likelier(new: Fit, old: Fit) -> float:
@@ -149,7 +142,7 @@ def refitted(of: Fit, others: Sequence[Experiment]) -> Fit:
     Raises SimulationError.
     """
     try:
-        return refit(of, weighted(of, others), sigma=of.sigma, tolerance=1e-6)
+        return refit(of, others=others, sigma=of.sigma, tolerance=1e-6)
     except PsaError:
         return search_starts(of.model, weighted(of, others), of.unknowns.names, starts=1)[0]
 
@@ -182,16 +175,16 @@ _ROUNDING = 1e-6
 Otherwise = tuple[tuple[Experiment, ...], Note]
 
 
-def smooth_between(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
+def smooth_between(fit: Fit) -> Otherwise | None:
     """Return the experiments with the voltage moved to a smooth curve's mean, and a note; or None.
 
     None where the error of the `fit` does not hold the difference, or a record cannot be simulated.
     """
-    held = _held(fit, experiments, _of_smooth)
+    held = _held(fit, _of_smooth)
     if held is None:
         return None
     moved = []
-    for e in experiments:
+    for e in fit.experiments:
         # a sample is moved by the mean of the intervals on its sides
         higher = _higher(e.record)
         others = np.concatenate([higher[:1], _middle(higher), higher[-1:]])
@@ -200,16 +193,17 @@ def smooth_between(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | N
     return tuple(moved), note("smooth_voltage", share=share, low=low, high=high)
 
 
-def even_clock(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
+def even_clock(fit: Fit) -> Otherwise | None:
     """Return the experiments with samples at even times, and a note; or None.
 
     None where the stamps are even or farther than half a sample from it, where the error of the
     `fit` does not hold the difference, or a record cannot be simulated.
     """
+    experiments = fit.experiments
     even = [_evened(e.record) for e in experiments]
     held = None
     if any(record is not e.record for record, e in zip(even, experiments, strict=True)):
-        held = _held(fit, experiments, _of_even)
+        held = _held(fit, _of_even)
     if held is None:
         return None
     moved = tuple(replace(e, record=record) for e, record in zip(experiments, even, strict=True))
@@ -222,7 +216,7 @@ def even_clock(fit: Fit, experiments: Sequence[Experiment]) -> Otherwise | None:
 
 
 def _held(
-    fit: Fit, experiments: Sequence[Experiment], change: Callable[[Fit, int, Record], FloatArray]
+    fit: Fit, change: Callable[[Fit, int, Record], FloatArray]
 ) -> tuple[float, float, float] | None:
     """Return the share of a change of displacement (n,) that a fit's error holds, and its interval.
 
@@ -231,7 +225,7 @@ def _held(
     try:
         parts = [
             (np.zeros(e.record.n) if e.held_out_whole else change(fit, k, e.record))[e.used]
-            for k, e in enumerate(experiments)
+            for k, e in enumerate(fit.experiments)
         ]
     except PsaError:
         return None

@@ -17,7 +17,7 @@ free, and a full fit from each of the best. The play operators of `starting_poin
 what is wrong with that force. A better fit has a better force.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import log
 
@@ -28,13 +28,9 @@ from psa_casadi.common.errors import PsaError
 from psa_casadi.common.progress import Progress
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fitting.fit import Fit, fit
+from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.fitting.prediction import measured, predict
-from psa_casadi.identification.fitting.unknowns import (
-    static_compliance,
-    unknowns_of,
-    within_bounds,
-)
+from psa_casadi.identification.fitting.unknowns import static_compliance, unknowns_of, within_bounds
 from psa_casadi.identification.refitting import (
     differing,
     equal,
@@ -47,7 +43,7 @@ from psa_casadi.identification.refitting import (
 from psa_casadi.identification.start.linear_response import oscillators
 from psa_casadi.identification.start.starting_points import Excerpt, fastest_part, placed, sought
 from psa_casadi.records.record import Record
-from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.records.split import fitted
 from psa_casadi.simulation.simulate import record_inputs, simulate_record
 
 Values = Mapping[str, float]
@@ -83,43 +79,40 @@ def exchanges(p: Values) -> Iterator[tuple[str, dict[str, float]]]:
 FAST = ("m_P", "m_B", "m", "k_P")
 #: Without this relative standard error k_P stays where it is: it would only blur every force.
 _SHARP = 0.1
-#: Evaluations of a fit from exchanged values, first and then to the end; rounds of exchanges; how
-#: far above the best cost a first fit may be to be followed.
-_FIRST, _LAST, _ROUNDS, _HOPEFUL = 5, 30, 3, 2.0
+#: Evaluations of a fit with fast parameters, and from exchanged values, first and then to the end;
+#: rounds of exchanges; how far above the best cost a first fit may be to be followed.
+_WIDER, _FIRST, _LAST, _ROUNDS, _HOPEFUL = 40, 5, 30, 3, 2.0
 
 
-def with_fast(best: Fit, experiments: Sequence[Experiment], progress: Progress) -> Fit:
+def with_fast(best: Fit, progress: Progress) -> Fit:
     """Free the fast parameters that these records determine, if that lowers the cost clearly."""
     free = best.unknowns.names
     available = [n for n in FAST if n in best.model.values and n not in (*free, "k_P")]
-    more = [n for n in available if _would_determine(best, experiments, n)]
+    more = [n for n in available if _would_determine(best, n)]
     if not more:
         return best
     progress(f"base fit with {', '.join(more)}")
-    states = best.starts()
     try:
-        wider = fit(best.model, experiments, [*free, *more], sigma=best.sigma, start_states=states)
+        wider = refit(best, [*free, *more], sigma=best.sigma, evaluations=_WIDER)
     except PsaError:
         return best
     needed = len(more) * np.log(len(best.residuals))
     return wider if wider.interrupted or wider.data_cost < best.data_cost - needed else best
 
 
-def without_blur(best: Fit, experiments: Sequence[Experiment]) -> Fit:
+def without_blur(best: Fit) -> Fit:
     """Fix k_P where it is if its standard error is large: forces then keep their proportions."""
     names = best.unknowns.names
     if "k_P" not in names:
         return best
     k = names.index("k_P")
-    if np.sqrt(covariance_of(best, experiments)[k, k]) < _SHARP:
+    if np.sqrt(covariance_of(best)[k, k]) < _SHARP:
         return best
     free = [n for n in names if n != "k_P"]
-    return refit_or_keep(best, experiments, free, sigma=best.sigma)
+    return refit_or_keep(best, free, sigma=best.sigma)
 
 
-def exchanged(
-    best: Fit, experiments: Sequence[Experiment], progress: Progress
-) -> tuple[Fit, tuple[str, ...]]:
+def exchanged(best: Fit, progress: Progress) -> tuple[Fit, tuple[str, ...]]:
     """Fit again with factors of the linear part exchanged; return the best, and what stays open.
 
     See `exchanges`. The records do not determine parameters of an exchange that fits as well. After
@@ -132,20 +125,17 @@ def exchanged(
             progress(f"exchanged: {what}")
             moved = within_bounds(best.model, values)
             other = quick_from(
-                best, best.model.with_values(moved), experiments, best.unknowns.names,
+                best, best.model.with_values(moved), best.unknowns.names,
                 start_states=best.starts(), evaluations=_FIRST,
             )  # fmt: skip
             near = other and other.data_cost <= _HOPEFUL * best.data_cost
             if other is None or other.interrupted or not near:
                 continue
             try:
-                other = fit(
-                    other.model, experiments, best.unknowns.names, sigma=best.sigma,
-                    start_states=other.starts(), evaluations=_LAST,
-                )  # fmt: skip
+                other = refit(other, sigma=best.sigma, evaluations=_LAST)
             except PsaError:
                 continue
-            different |= set(differing(best, other, experiments))
+            different |= set(differing(best, other))
             if other.data_cost < best.data_cost and (other.interrupted or not equal(best, other)):
                 best = other
                 break
@@ -154,9 +144,9 @@ def exchanged(
     return best, ()
 
 
-def _would_determine(best: Fit, experiments: Sequence[Experiment], name: str) -> bool:
+def _would_determine(best: Fit, name: str) -> bool:
     """Whether a further parameter would have a standard error below half a logarithmic unit."""
-    known, count = best.unknowns, len(best.unknowns.names)
+    experiments, known, count = best.experiments, best.unknowns, len(best.unknowns.names)
     none: list[dict[str, float]] = [{} for _ in experiments]
     fresh = unknowns_of(
         best.model, [*known.names, name], none, known.first_voltage, known.offset_scale
@@ -216,9 +206,7 @@ _FREE = ("m_P", "m_B", "k_P")
 _FORCES = ("k_L", "A", "beta", "gamma", "delta", "h_ref")
 
 
-def retuned(
-    best: Fit, experiments: Sequence[Experiment], progress: Progress, *, reached: float = np.inf
-) -> Fit:
+def retuned(best: Fit, progress: Progress, *, reached: float = np.inf) -> Fit:
     """Return a fit whose mechanics was sought again while that explains more; `best` if nothing.
 
     It is sought while residuals of records exceed their fast part, which has some of a misfit's
@@ -229,14 +217,14 @@ def retuned(
     if "k_P" not in best.model.values:
         return best
     for _ in range(_REPEATS):
-        levels = residual_noise(best, experiments)
-        pairs = zip(record_rms(best, experiments), levels, strict=True)
+        levels = residual_noise(best)
+        pairs = zip(record_rms(best), levels, strict=True)
         misfit = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
         if best.interrupted or not misfit:
             return best
         progress("base fit, mechanics again behind the force found")
         try:
-            better = _once(best, experiments)
+            better = _once(best)
         except KeyboardInterrupt:
             return replace(best, interrupted=True)
         except (PsaError, np.linalg.LinAlgError):
@@ -247,8 +235,8 @@ def retuned(
     return best
 
 
-def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
-    parts = list(_parts(best, experiments))
+def _once(best: Fit) -> Fit | None:
+    parts = list(_parts(best))
     if not parts:
         return None
     ratio = log(best.model.values["k_P"] / best.model.values["k_B"])
@@ -263,22 +251,22 @@ def _once(best: Fit, experiments: Sequence[Experiment]) -> Fit | None:
             {n: v * (scale if n in forces else 1.0) for n, v in s.items()} for s in best.starts()
         ]
         quick = quick_from(
-            best, best.model.with_values(values), experiments, names,
+            best, best.model.with_values(values), names,
             start_states=states, evaluations=_QUICK,
         )  # fmt: skip
         fits += [quick] if quick else []
     nearest = sorted(fits, key=lambda f: f.data_cost)[:_ENDED]
-    ended = [refit(f, experiments, names, sigma=best.sigma, least=best.rms) for f in nearest]
+    ended = [refit(f, names, sigma=best.sigma, least=best.rms) for f in nearest]
     if any(f.interrupted for f in (*nearest, *ended)):
         raise KeyboardInterrupt
     return min(ended, key=lambda f: f.data_cost, default=None)
 
 
-def _parts(best: Fit, experiments: Sequence[Experiment]) -> Iterator[Excerpt]:
+def _parts(best: Fit) -> Iterator[Excerpt]:
     """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
-    fastest = min(e.record.sample_time for e in fitted(experiments))
-    values, levels, total = best.model.values, residual_noise(best, experiments), 0
-    for k, e in enumerate(experiments):
+    fastest = min(e.record.sample_time for e in fitted(best.experiments))
+    values, levels, total = best.model.values, residual_noise(best), 0
+    for k, e in enumerate(best.experiments):
         record, y = e.record, measured(e.record)
         steps, there = np.diff(record.time), np.isfinite(y)
         uneven = np.ptp(steps) > 0.01 * record.sample_time

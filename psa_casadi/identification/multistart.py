@@ -10,14 +10,7 @@ import numpy as np
 from psa_casadi.common.errors import InputError, PsaError, quoted
 from psa_casadi.common.progress import Progress, silent
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.refitting import (
-    refit,
-    relevelled,
-    reweighted,
-    unlike,
-    weighted,
-    with_noise,
-)
+from psa_casadi.identification.refitting import refit, relevelled, reweighted, unlike, with_noise
 from psa_casadi.identification.result import StartOutcome
 from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import Parameter
@@ -92,8 +85,8 @@ def search_starts(
     *,
     starts: int,
     progress: Progress = silent,
-) -> tuple[Fit, tuple[Experiment, ...], tuple[StartOutcome, ...]]:
-    """Return the best fit from several starts, the experiments with their noise, and the starts.
+) -> tuple[Fit, tuple[StartOutcome, ...]]:
+    """Return the best fit from several starts, with the experiments' noise, and the starts.
 
     The costs are those with the same noise in all experiments. Raises SimulationError where none
     can be simulated.
@@ -123,24 +116,22 @@ def search_starts(
         ) from error
     cut = any(f.interrupted for _, f in ranked)
     ended = [
-        refit(f, weighted(f, experiments), sigma=f.sigma, tolerance=1e-6)
+        refit(f, sigma=f.sigma, tolerance=1e-6)
         for _, f in ranked[: 0 if cut or starts == 1 else _FOLLOWED]
     ]
     fits = dict(ranked) | {name: f for (name, _), f in zip(ranked, ended, strict=False)}
     best = min(fits.values(), key=lambda f: f.cost)
     outcomes = tuple(_outcome(name, fits.get(name), best) for name, _ in points)
     if cut:
-        return replace(best, interrupted=True, converged=False), (*experiments,), outcomes
-    return *levelled(best, experiments), outcomes
+        return replace(best, interrupted=True, converged=False), outcomes
+    return levelled(best), outcomes
 
 
-def levelled(best: Fit, experiments: Sequence[Experiment]) -> tuple[Fit, tuple[Experiment, ...]]:
+def levelled(best: Fit) -> Fit:
     """Fit again with the noise that every output leaves; and that of each experiment."""
-    best = relevelled(best, experiments, every=True)[0]
-    again = with_noise(best, experiments)
-    if unlike(again, experiments):
-        best = reweighted(best, again)
-    return best, again
+    best = relevelled(best, every=True)
+    again = with_noise(best)
+    return reweighted(best, again) if unlike(again, best.experiments) else best
 
 
 def _outcome(name: str, end: Fit | None, best: Fit) -> StartOutcome:

@@ -182,11 +182,9 @@ def moment_coefficients(time: FloatArray, g: FloatArray) -> FloatArray:
     K_1..K_6, eqs. (16), (19), with the trapezoidal rule: g_1' = 1 - g,  g_i' = K_(i-1) - g_(i-1),
     K_i = lim g_i, for which the last sample is taken.
     """
-    width = np.diff(time)
     limit, current, limits = 1.0, g, []
     for _ in range(6):
-        rest = limit - current
-        current = np.concatenate([[0.0], np.cumsum(0.5 * (rest[1:] + rest[:-1]) * width)])
+        current = scipy.integrate.cumulative_trapezoid(limit - current, time, initial=0)
         limit = float(current[-1])
         limits.append(limit)
     return coefficients_of_limits(np.array(limits))
@@ -200,11 +198,8 @@ def coefficients_of_limits(limits: FloatArray) -> FloatArray:
     """
     unit = abs(float(limits[0])) or 1.0
     k = np.concatenate([[1.0], limits / unit ** np.arange(1, 7)])
-    matrix = np.zeros((6, 6))
-    for i in range(1, 7):
-        for j in range(1, min(i, 5) + 1):
-            matrix[i - 1, j - 1] = (-1) ** (j - 1) * k[i - j]
-    matrix[0, 5] = -1.0
+    matrix = scipy.linalg.toeplitz(k[:6], np.zeros(6)) * (-1.0) ** np.arange(6)
+    matrix[:, 5] = [-1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     scaled = np.linalg.lstsq(matrix, k[1:], rcond=None)[0]
     values: FloatArray = scaled * unit ** np.array([1.0, 2.0, 3.0, 4.0, 5.0, 1.0])
     return values
@@ -540,10 +535,7 @@ def conditions(
 
 
 def in_forces(
-    start: Model,
-    k: float | None,
-    coefficients: Mapping[str, float] | None,
-    bend: HysteresisPart,
+    start: Model, k: float | None, coefficients: Mapping[str, float] | None, bend: HysteresisPart
 ) -> tuple[Model, tuple[str, ...], list[Note]]:
     """Return `start` with all that is identified, k_P and k_B being those of `start`.
 
@@ -653,7 +645,7 @@ def identify_by_paper(
         usual = paper.model.with_values(ordinary_values(paper.model, records))
         best = fit(usual, experiments, [], sigma=sigma)
         doubts, result = (*doubts, note("runs_away")), ()
-    nothing = determinacy(best, experiments)
+    nothing = determinacy(best)
     model = with_provenance(best.model, nothing, records, stiffness is not None)
     notes = (*model.provenance.notes, str(note("paper", names=result)))
     provenance = replace(model.provenance, notes=notes)
@@ -661,7 +653,6 @@ def identify_by_paper(
         model=replace(model, provenance=provenance),
         fit=best,
         determinacy=nothing,
-        experiments=experiments,
         doubts=doubts,
         read_off=result,
     )

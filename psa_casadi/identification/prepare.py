@@ -13,7 +13,7 @@ from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.model.component import Component
-from psa_casadi.model.components.outputs import MONITOR, SECOND_SENSOR, STRAIN_GAUGE
+from psa_casadi.model.components.outputs import monitor, second_sensor, strain_gauge
 from psa_casadi.model.compose import Model
 from psa_casadi.records.decimate import decimated
 from psa_casadi.records.noise import fast_noise
@@ -36,7 +36,7 @@ COLUMNS: Mapping[str, Channel] = {
 }
 #: The sensor that a model gets for a column.
 SENSORS: Mapping[str, Component] = {
-    "monitor_voltage": MONITOR, "displacement_2": SECOND_SENSOR, "strain": STRAIN_GAUGE
+    "monitor_voltage": monitor, "displacement_2": second_sensor, "strain": strain_gauge
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from psa_casadi.common.progress import Progress, silent
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of, weighted_rows
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.records.split import Experiment
+from psa_casadi.model.variables import NORMAL_95
 
 _EVALUATIONS = 40
 #: A step out is at most this many times the distance that has been covered.
@@ -29,11 +29,8 @@ _RETRIES = 3
 class _HeldFits:
     """The fits of all other unknowns while one parameter is held; z is its logarithm or itself."""
 
-    def __init__(
-        self, best: Fit, experiments: Sequence[Experiment], name: str, limit: float,
-        progress: Progress,
-    ) -> None:  # fmt: skip
-        self.best, self.experiments, self.name, self.limit = best, experiments, name, limit
+    def __init__(self, best: Fit, name: str, limit: float, progress: Progress) -> None:
+        self.best, self.name, self.limit = best, name, limit
         self._progress, parameter = progress, best.model.parameter(name)
         self.log = parameter.log
         self._tolerance = float(np.clip(_CLOSE * limit / best.cost, 1e-9, 1e-5))
@@ -61,7 +58,7 @@ class _HeldFits:
         self._progress(f"profile of {self.name}, {value:.4g}")
         try:
             result = fit(
-                self.best.model.with_values({self.name: value}), self.experiments, self._free,
+                self.best.model.with_values({self.name: value}), self.best.experiments, self._free,
                 sigma=self.best.sigma, start={n: before.model.values[n] for n in self._free},
                 start_states=before.starts(), evaluations=_EVALUATIONS,
                 tolerance=self._tolerance,
@@ -128,7 +125,7 @@ class _HeldFits:
 
 
 #: The 95 % quantile of chi-square with one degree of freedom.
-PROFILE_LIMIT = 3.841458820694124
+PROFILE_LIMIT = NORMAL_95**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,14 +152,7 @@ class Profile:
     high: float | None
 
 
-def profile(
-    fit: Fit,
-    experiments: Sequence[Experiment],
-    name: str,
-    *,
-    points: int = 10,
-    progress: Progress = silent,
-) -> Profile:
+def profile(fit: Fit, name: str, *, points: int = 10, progress: Progress = silent) -> Profile:
     """Return the profile likelihood of a free parameter of a fit, with up to `points` on each side.
 
     The parameter is held on a grid that grows outwards until the limit is crossed; every point is
@@ -181,8 +171,8 @@ def profile(
                 f" {', '.join(fit.unknowns.names)}."
             ]
         )
-    spread, ratio = _spread(fit, experiments, name)
-    held = _HeldFits(fit, experiments, name, ratio * PROFILE_LIMIT, progress)
+    spread, ratio = _spread(fit, name)
+    held = _HeldFits(fit, name, ratio * PROFILE_LIMIT, progress)
     parameter, estimate = fit.model.parameter(name), fit.model.values[name]
     centre = held.minimum(held.coordinate(estimate), fit)
     if centre is None:
@@ -225,17 +215,16 @@ def _crossing(z: FloatArray, level: FloatArray) -> float | None:
     return float(z[last - 1] + (1.0 - inner) / (outer - inner) * (z[last] - z[last - 1]))
 
 
-def _spread(best: Fit, experiments: Sequence[Experiment], name: str) -> tuple[float, float]:
+def _spread(best: Fit, name: str) -> tuple[float, float]:
     """Return a parameter's standard error, and its variance over that at white residuals."""
     unknowns = best.unknowns
     count = len(unknowns.names)
     gradient = np.zeros(unknowns.size)
     gradient[:count] = unknowns.slopes(best.theta)[unknowns.names.index(name)]
     white, coloured = (
-        float(gradient @ covariance_of(best, experiments, white=w) @ gradient)
-        for w in (True, False)
+        float(gradient @ covariance_of(best, white=w) @ gradient) for w in (True, False)
     )
     result = max(coloured, 1e-12 * white)
     # a parameter that the prior holds has no ratio: the residuals' variance takes its place
-    rows = np.concatenate([residuals for _, residuals in weighted_rows(best, experiments)])
+    rows = np.concatenate([residuals for _, residuals in weighted_rows(best)])
     return float(np.sqrt(result)), max(result / white, float(np.mean(rows**2)))

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Unpack
 
 import numpy as np
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.identification.determinacy import covariance_of
-from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
+from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, How, fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import first_order_noise, high_frequency_noise, uncertain
@@ -53,60 +54,56 @@ def quick_rtol(sigma: Sequence[float], experiments: Sequence[Experiment]) -> flo
     return float(np.clip(_OF_NOISE * min(shares, default=1.0), FIT_RTOL, _QUICK_RTOL))
 
 
-def record_rms(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
+def record_rms(previous: Fit) -> list[float]:
     """Return the root mean square of every record's residual [m]."""
-    parts = previous.residuals_of(experiments)
+    parts = previous.record_residuals
     return [max(float(np.sqrt(np.mean(p**2))), 1e-15) if len(p) else 1e-15 for p in parts]
 
 
-def residual_noise(previous: Fit, experiments: Sequence[Experiment]) -> list[float]:
+def residual_noise(previous: Fit) -> list[float]:
     """Return the white noise of every record's residual [m], from its fast differences.
 
     That of a record without a fitted sample stays as it was.
     """
-    parts = zip(previous.residuals_of(experiments), previous.sigma, strict=True)
+    parts = zip(previous.record_residuals, previous.sigma, strict=True)
     return [max(high_frequency_noise(p), 1e-15) if p.size else sigma for p, sigma in parts]
 
 
 def refit(
     previous: Fit,
-    experiments: Sequence[Experiment],
     free: Sequence[str] | None = None,
     *,
+    others: Sequence[Experiment] | None = None,
     sigma: Sequence[float] | None = None,
     least: float = np.inf,
-    evaluations: int | None = None,
-    tolerance: float = 1e-5,
+    **how: Unpack[How],
 ) -> Fit:
     """Continue a fit from its end, of the same parameters unless others are `free`.
 
-    Without `sigma` the noise levels are those that its residuals suggest. It may end early where
-    the rms will stay above `least`, in the unit of the first output.
+    `others` are as many experiments that take the place of those of the fit, which keep the levels
+    of its further channels. Without `sigma` the noise levels are those that its residuals suggest.
+    It may end early where the rms will stay above `least`, in the unit of the first output.
     """
-    levels = sigma or residual_noise(previous, experiments)
-    parts = zip(previous.residuals_of(experiments), levels, strict=True)
+    levels = sigma or residual_noise(previous)
+    parts = zip(previous.record_residuals, levels, strict=True)
     now = sum(float(np.sum((part / level) ** 2)) for part, level in parts)
+    how.setdefault("evaluations", POLISH)
+    how.setdefault("goal", now * (least / max(previous.rms, 1e-300)) ** 2)
     return fit(
         previous.model,
-        experiments,
+        previous.experiments if others is None else weighted(previous, others),
         previous.unknowns.names if free is None else free,
-        sigma=levels,
-        start_states=previous.starts(),
-        evaluations=evaluations or POLISH,
-        tolerance=tolerance,
-        goal=now * (least / max(previous.rms, 1e-300)) ** 2,
-    )
+        sigma=levels, start_states=previous.starts(), **how,
+    )  # fmt: skip
 
 
-def relevelled(
-    best: Fit, experiments: Sequence[Experiment], *, every: bool = False
-) -> tuple[Fit, tuple[Experiment, ...]]:
+def relevelled(best: Fit, *, every: bool = False) -> Fit:
     """Fit again with what the fit leaves of every further channel as its noise level.
 
     With `every`, of the first one too, until the levels stay the same. The fit itself if there is
     no such channel, or it was interrupted.
     """
-    now, rounds = tuple(experiments), _ALL_ROUNDS if every else _LEVEL_ROUNDS
+    rounds = _ALL_ROUNDS if every else _LEVEL_ROUNDS
     for _ in range(rounds if best.further else int(every)):
         channels = best.channels if every else best.further
         levels = [f.relevelled() for f in channels]
@@ -114,10 +111,12 @@ def relevelled(
         same = all(abs(float(np.log(f.level / q.level))) < _SAME_LEVEL for f, q in pairs)
         if best.interrupted or same:
             break
-        now = tuple(e.with_further(levels[every:]) for e in now)
-        sigma = [max(levels[0].level, 1e-300)] * len(now) if every else best.sigma
-        best = refit_or_keep(best, now, sigma=sigma, tolerance=1e-6 if every else 1e-5)
-    return best, now
+        sigma = [max(levels[0].level, 1e-300)] * len(best.sigma) if every else best.sigma
+        best = replace(
+            best, experiments=tuple(e.with_further(levels[every:]) for e in best.experiments)
+        )
+        best = refit_or_keep(best, sigma=sigma, tolerance=1e-6 if every else 1e-5)
+    return best
 
 
 def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]:
@@ -129,16 +128,17 @@ def weighted(before: Fit, experiments: Sequence[Experiment]) -> list[Experiment]
 _FEWEST, _SURE = 32, 3.0
 
 
-def with_noise(fit: Fit, experiments: Sequence[Experiment]) -> tuple[Experiment, ...]:
+def with_noise(fit: Fit) -> tuple[Experiment, ...]:
     """Return the experiments with their shares of the noise, from the fast parts of residuals.
 
     Of every output, over the usual one of all experiments (the geometric mean by samples). A share
     that does not differ from 1 is 1. Of an experiment that is held out whole, its first tenth
     counts.
     """
+    experiments = fit.experiments
     shares = [[e.share(j) for j, _ in enumerate(e.channels)] for e in experiments]
     whole = [k for k, e in enumerate(experiments) if e.held_out_whole]
-    predicted = fit.predicted_channels(experiments) if whole else []
+    predicted = fit.predicted_channels() if whole else []
     for o in fit.channels:
         j = o.number
         rows = ((k, experiments[k], predicted[k][:, j]) for k in whole)
@@ -164,21 +164,16 @@ def unlike(experiments: Sequence[Experiment], others: Sequence[Experiment]) -> b
 
 def reweighted(best: Fit, experiments: Sequence[Experiment]) -> Fit:
     """Fit again with other shares of the noise."""
-    again = refit(best, weighted(best, experiments), sigma=best.sigma, tolerance=1e-6)
-    return relevelled(again, experiments, every=True)[0]
+    again = refit(best, others=experiments, sigma=best.sigma, tolerance=1e-6)
+    return relevelled(again, every=True)
 
 
 def refit_or_keep(
-    previous: Fit,
-    experiments: Sequence[Experiment],
-    free: Sequence[str] | None = None,
-    *,
-    sigma: Sequence[float],
-    tolerance: float = 1e-5,
+    previous: Fit, free: Sequence[str] | None = None, *, sigma: Sequence[float], **how: Unpack[How]
 ) -> Fit:
     """Return the `refit`, or the previous fit where that leads to what cannot be simulated."""
     try:
-        return refit(previous, experiments, free, sigma=sigma, tolerance=tolerance)
+        return refit(previous, free, sigma=sigma, **how)
     except PsaError:
         return previous
 
@@ -186,7 +181,6 @@ def refit_or_keep(
 def quick_from(
     previous: Fit,
     model: Model,
-    experiments: Sequence[Experiment],
     free: Sequence[str],
     *,
     start_states: Sequence[Mapping[str, float]],
@@ -196,15 +190,10 @@ def quick_from(
     """Fit a little from other values, weighted as before; None if these cannot be simulated."""
     try:
         return fit(
-            model,
-            experiments,
-            free,
-            sigma=previous.sigma,
-            start=start,
-            start_states=start_states,
-            evaluations=evaluations,
-            rtol=quick_rtol(previous.sigma, experiments),
-        )
+            model, previous.experiments, free, sigma=previous.sigma, start=start,
+            start_states=start_states, evaluations=evaluations,
+            rtol=quick_rtol(previous.sigma, previous.experiments),
+        )  # fmt: skip
     except PsaError:
         return None
 
@@ -221,18 +210,18 @@ def equal(one: Fit, other: Fit) -> bool:
     return abs(one.data_cost - other.data_cost) < limit
 
 
-def differing(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> tuple[str, ...]:
+def differing(one: Fit, other: Fit) -> tuple[str, ...]:
     """Return the parameters in which two equally likely fits differ beyond their intervals."""
     if one is other or not equal(one, other):
         return ()
     count = len(one.unknowns.names)
     there = one.unknowns.coordinates(other.model.values)
-    variances = np.diag(covariance_of(one, experiments))[:count]
+    variances = np.diag(covariance_of(one))[:count]
     errors = np.sqrt(np.where(variances > 0.0, variances, np.inf))  # by rounding of what is open
     apart = np.abs(there - one.theta[:count]) > _APART * errors
     return tuple(n for n, far in zip(one.unknowns.names, apart, strict=True) if far)
 
 
-def same_place(one: Fit, other: Fit, experiments: Sequence[Experiment]) -> bool:
+def same_place(one: Fit, other: Fit) -> bool:
     """Whether two fits are equally likely and differ in no parameter beyond its interval."""
-    return equal(one, other) and not differing(one, other, experiments)
+    return equal(one, other) and not differing(one, other)

@@ -29,6 +29,7 @@ from psa_casadi.identification.refitting import (
     noise_levels,
     quick_rtol,
     record_rms,
+    refit,
     refit_or_keep,
     residual_noise,
     same_place,
@@ -40,7 +41,7 @@ from psa_casadi.identification.start.starting_points import (
     resolved,
     starting_points,
 )
-from psa_casadi.model.components.stack import MEMORY_SPECTRUM
+from psa_casadi.model.components.stack import memory_spectrum
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.record import Record
@@ -49,7 +50,7 @@ from psa_casadi.simulation.timings import stage
 
 #: Parameters that voltage and displacement determine in every record with loops.
 CORE = (
-    *("k_L", "A", "beta", "gamma", "delta", "n", *MEMORY_SPECTRUM.fitted),
+    *("k_L", "A", "beta", "gamma", "delta", "n", *memory_spectrum.fitted),
     *("tau", "R_s", "c_P", "c_B", "c"),
 )
 
@@ -111,34 +112,30 @@ def search(
     noise. A keyboard interrupt ends the search at the best fit so far, if there is one. Raises
     PsaError when no start can be simulated.
     """
-    so_far: list[Fit] = []
     off = (c for c in model.effects if c.linear and model.values[c.gain or ""] == 0.0)
     model = model.with_values({n: v for c in off for n, v in c.at_gain(0.0, {}).items()})
+    so_far: list[Fit] = []
+    records = [e.record for e in fitted(experiments)]
+    mechanics = resolved(model, linear, min(r.sample_time for r in records))
+    free = [*free_parameters(model, records), *mechanics]
+    starts = starting_points(model, linear, records)
     try:
-        return _search(model, experiments, linear, thorough, progress, so_far.append)
+        ranked = _quick_fits(model, experiments, free, starts, progress, so_far)
+        return _ended(ranked, progress, so_far, thorough=thorough, retune=bool(mechanics))
     except KeyboardInterrupt:
         if not so_far:
             raise
         return Search(replace(so_far[-1], interrupted=True, converged=False), (), ())
 
 
-def _search(
-    model: Model,
-    experiments: Sequence[Experiment],
-    linear: Sequence[LinearCandidate],
-    thorough: bool,
-    progress: Progress,
-    keep: Callable[[Fit], None],
-) -> Search:
-    """Search as `search` does; `keep` gets every fit that is better than those before it."""
-    records = [e.record for e in fitted(experiments)]
-    core = free_parameters(model, records)
-    mechanics = resolved(model, linear, min(r.sample_time for r in records))
-    starts = starting_points(model, linear, records)
-    ranked = _quick_fits(model, experiments, [*core, *mechanics], starts, progress, keep)
+def _ended(
+    ranked: Sequence[tuple[str, Fit]], progress: Progress, so_far: list[Fit],
+    *, thorough: bool, retune: bool,
+) -> Search:  # fmt: skip
+    """Follow the best quick fits to their end; `so_far` gets every fit that is the best then."""
     first = ranked[0][1]
-    keep(first)
-    sigma = residual_noise(first, experiments)
+    so_far.append(first)
+    sigma = residual_noise(first)
     polished: dict[str, Fit] = {}
     for name, quick in ranked:
         near = quick.data_cost < (_NEAR if thorough else _CLOSE) * first.data_cost
@@ -147,34 +144,31 @@ def _search(
         stopped = any(f.interrupted for f in polished.values())
         if polished and (stopped or not (misfit or (near and len(polished) < 2))):
             break
-        if polished and not thorough and same_place(first, quick, experiments):
+        if polished and not thorough and same_place(first, quick):
             continue
         progress(f"base fit, {name} to the end")
-        ended = quick if quick.interrupted else refit_or_keep(quick, experiments, sigma=sigma)
+        ended = quick if quick.interrupted else refit_or_keep(quick, sigma=sigma)
         polished[name] = ended
-        keep(min(polished.values(), key=lambda f: f.data_cost))
+        so_far.append(min(polished.values(), key=lambda f: f.data_cost))
     top = best = min(polished.values(), key=lambda f: f.data_cost)
     if not best.interrupted:
-        best = with_fast(best, experiments, progress)
-        tuned = retuned(best, experiments, progress) if mechanics else best
+        best = with_fast(best, progress)
+        tuned = retuned(best, progress) if retune else best
         if tuned is not best:
             top = best = tuned
-        keep(best)
-        best = without_blur(best, experiments)
-        keep(best)
-    outcomes, not_unique = _outcomes(ranked, polished, top, experiments)
+        so_far.append(best)
+        best = without_blur(best)
+        so_far.append(best)
+    outcomes, not_unique = _outcomes(ranked, polished, top)
     if thorough and not best.interrupted:
-        best, open_ones = exchanged(best, experiments, progress)
+        best, open_ones = exchanged(best, progress)
         not_unique |= set(open_ones)
     names = best.unknowns.names
     return Search(best, outcomes, tuple(n for n in names if n in not_unique))
 
 
 def _outcomes(
-    ranked: Sequence[tuple[str, Fit]],
-    polished: Mapping[str, Fit],
-    best: Fit,
-    experiments: Sequence[Experiment],
+    ranked: Sequence[tuple[str, Fit]], polished: Mapping[str, Fit], best: Fit
 ) -> tuple[tuple[StartOutcome, ...], set[str]]:
     """Return the outcome of every start, and the parameters in which equally good fits differ."""
     outcomes, not_unique = [], set[str]()
@@ -183,7 +177,7 @@ def _outcomes(
         if final is None:
             outcomes.append(StartOutcome(name, quick.data_cost, quick.rms, None))
             continue
-        names = differing(best, final, experiments)
+        names = differing(best, final)
         agrees = final is best or (names == () and equal(best, final))
         not_unique |= set(names)
         outcomes.append(StartOutcome(name, final.data_cost, final.rms, agrees))
@@ -191,13 +185,9 @@ def _outcomes(
 
 
 def _quick_fits(
-    model: Model,
-    experiments: Sequence[Experiment],
-    free: Sequence[str],
-    starts: Sequence[tuple[str, dict[str, float]]],
-    progress: Progress,
-    keep: Callable[[Fit], None],
-) -> list[tuple[str, Fit]]:
+    model: Model, experiments: Sequence[Experiment], free: Sequence[str],
+    starts: Sequence[tuple[str, dict[str, float]]], progress: Progress, so_far: list[Fit],
+) -> list[tuple[str, Fit]]:  # fmt: skip
     """Fit from every start with few evaluations; return those that could be simulated."""
     sigma = noise_levels(experiments)
     quickly: dict[str, Any] = {"sigma": sigma, "rtol": quick_rtol(sigma, experiments)}
@@ -208,8 +198,7 @@ def _quick_fits(
         return fit(model, experiments, free, start=start, evaluations=rounds[0], **quickly)
 
     fits = sorted(fits_from(starts, quick_fit), key=lambda pair: pair[1].data_cost)
-    for _, best in fits[:1]:
-        keep(best)
+    so_far.append(fits[0][1])
     widest = max(e.record.range_m for e in fitted(experiments))
     # a loop that diverges is left there, unless all do
     fits = [pair for pair in fits if pair[1].rms < widest] or fits
@@ -217,18 +206,8 @@ def _quick_fits(
         if any(f.interrupted for _, f in fits):
             break
         progress(f"base fit from {name}, continued")
-        states = quick.starts()
         with suppress(PsaError):  # where it leads to what cannot be simulated, the first one stays
-            further = fit(
-                quick.model, experiments, free, start_states=states, evaluations=rounds[1],
-                **quickly,
-            )  # fmt: skip
-            fits[k] = (name, further)
-    if not fits:
-        raise PsaError(
-            "The base model could not be simulated from any start; the voltage's unit or the"
-            " displacement's sign is the likely cause: check the record."
-        )
+            fits[k] = (name, refit(quick, evaluations=rounds[1], **quickly))
     return sorted(fits, key=lambda pair: pair[1].data_cost)
 
 
@@ -265,7 +244,7 @@ def search_forms(
     samples = [int(e.used.sum()) for e in experiments]
 
     def criterion(s: Search) -> float:
-        levels = record_rms(s.best, experiments)
+        levels = record_rms(s.best)
         likely = sum(n * np.log(level**2) for n, level in zip(samples, levels, strict=True))
         return float(likely + len(s.best.unknowns.names) * np.log(sum(samples)))
 
@@ -324,7 +303,7 @@ def loads_as_curves(
         record = replace(e.record, displacement=scaled, load_force=None)
         as_displacement.append(replace(e, record=record).with_further(()))
     predictions = [
-        fit_base(start, others, progress=progress).predicted(others)
+        fit_base(start, others, progress=progress).predicted()
         for others in (unloaded, tuple(as_displacement))
     ]
     curves = [_curve(load, x) for load, *x in zip(loads, *predictions, strict=True)]

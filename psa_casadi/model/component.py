@@ -297,6 +297,43 @@ class Component:
         return True
 
 
+_Written = Callable[[Symbols], Equations]
+#: What a component declares of each kind of variable.
+_VARIABLES: dict[str, type] = {
+    "parameters": Parameter, "states": State, "inputs": Input, "outputs": Output,
+}  # fmt: skip
+
+
+def component(
+    *variables: Parameter | State | Input | Output, **declared: Any
+) -> Callable[[_Written], Component]:
+    """Return a decorator that makes a component of the function of its equations.
+
+        @component(Parameter("k_L", ...), description="...", source="...")
+        def linear_force(s: Symbols) -> Equations:
+            return Equations(add={"free_force": s.k_L * s.u})
+
+    The component has the name of the function, which stays at `equations`, where pickles find it.
+    Its variables are in the order of `variables`; `declared` are fields of `Component`.
+    """
+    for kind, form in _VARIABLES.items():
+        declared[kind] = tuple(v for v in variables if isinstance(v, form))
+
+    def made(equations: _Written) -> Component:
+        name = equations.__name__
+        equations.__qualname__ = f"{name}.equations"
+        return Component(name=name, equations=equations, **declared)
+
+    return made
+
+
+def effect(
+    gain: Parameter, *variables: Parameter | State | Input, **declared: Any
+) -> Callable[[_Written], Component]:
+    """Return the decorator of an effect that its first parameter, the gain, removes at 0."""
+    return component(gain, *variables, gain=gain.name, **declared)
+
+
 @dataclass(frozen=True, eq=False)
 class KeptEquations:
     """Equations of a component that can be pickled: a function of the symbols of some names.

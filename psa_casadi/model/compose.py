@@ -51,6 +51,11 @@ class Model(Celled):
         return self.structure.components
 
     @property
+    def base(self) -> tuple[Component, ...]:
+        """The components that no gain can remove: the base physics."""
+        return tuple(c for c in self.components if c.gain is None)
+
+    @property
     def effects(self) -> tuple[Component, ...]:
         """The components that a gain can remove."""
         return tuple(c for c in self.components if c.gain is not None)

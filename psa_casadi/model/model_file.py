@@ -120,7 +120,7 @@ def dumps(model: Model) -> str:
         "name": model.name,
         "description": model.description,
         **({"publication": stated} if stated else {}),
-        "components": [c.name for c in model.components if c.gain is None],
+        "components": [c.name for c in model.base],
         "effects": [
             {"name": c.name, "module": c.home, "sha256": declaration_hash(c)} if c.home else c.name
             for c in model.effects

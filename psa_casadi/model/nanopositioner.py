@@ -38,11 +38,8 @@ class PlantResponse:
 
 def plant_response(plant: Model, position: str | None, period: float, lag: float) -> PlantResponse:
     """Return the exactly discretised response of the plant, linearised, behind a lag [s]."""
-    s = plant.structure
     row = plant.output_names.index(position) if position else 0
-    start = [v.start for v in s.states], [v.start for v in s.inputs]
-    slopes = s.slopes(0.0, *start, plant.parameter_vector())
-    A, B, C, _ = (np.array(m, dtype=float) for m in slopes)
+    A, B, C, _ = (np.array(m, dtype=float) for m in plant.structure.slopes(*plant.at_start()))
     size, n = plant.state_nominals(), len(A) + 1
     A, B, C = A * size / size[:, None], B / size[:, None], C[[row]] * size
     # the output behind a lag of first order
@@ -77,7 +74,7 @@ def plant_response(plant: Model, position: str | None, period: float, lag: float
 
 def notch_response(z: ComplexArray, period: float, frequency: float, floor: float, width: float
 ) -> ComplexArray:  # fmt: skip
-    """Return the notch that `POSITION_CONTROLLER` has, on the unit circle."""
+    """Return the notch that `position_controller` has, on the unit circle."""
     t = np.tan(min(np.pi * frequency * period, 1.5))
     w = (z - 1.0) / (z + 1.0) / t
     ratio: ComplexArray = (w * w + 2.0 * floor * w + 1.0) / (w * w + 2.0 * width * w + 1.0)

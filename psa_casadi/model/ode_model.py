@@ -308,6 +308,12 @@ def _declared(
             rows = []
         every = [_variable(kind, what, entry, values, problems) for entry in rows]
         table[column] = [v for v in every if v is not None]
+        declared, symbols = [v.name for v in table[column]], names.get(column) or []
+        if declared != symbols and sorted(declared) == sorted(symbols):
+            problems.add(
+                f"The {what} are {', '.join(declared)} and the symbols of '{column}'"
+                f" {', '.join(symbols)}; declare them in the order of the symbols."
+            )
     known = {p.name: p.value for p in table["p"]}
     for unknown in (k for k in values if k not in known and len(known) == f.numel_in("p")):
         problems.add(f"`values` has '{unknown}', which is no parameter; there are {[*known]}.")

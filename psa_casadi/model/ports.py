@@ -70,22 +70,14 @@ def ports_of(model: Model) -> tuple[Port, ...]:
     velocity) is a definition and no physics: it has no port, nor has an intermediate that is
     `kinematic`. States of effects have none either.
     """
-    base = [c for c in model.components if c.gain is None]
-    states = [q for c in base for q in c.states]
+    base = model.base
+    rates = [q for c in base for q in c.states if definition_of(model, q.name) is None]
+    sums = [w for c in base for w in plain(c).balances if w.name not in kinematic(c)]
     return (
         *(Port("input", i.name, _si(i.unit)) for c in base for i in c.inputs),
-        *(
-            Port("rate", q.name, rate_unit(_si(q.unit)))
-            for q in states
-            if definition_of(model, q.name) is None
-        ),
+        *(Port("rate", q.name, rate_unit(_si(q.unit))) for q in rates),
         *(Port("output", o.name, _si(o.unit)) for c in base for o in c.outputs),
-        *(
-            Port("intermediate", w.name, _si(w.unit))
-            for c in base
-            for w in plain(c).balances
-            if w.name not in kinematic(c)
-        ),
+        *(Port("intermediate", w.name, _si(w.unit)) for w in sums),
     )
 
 
@@ -96,8 +88,7 @@ def parameter_ports(model: Model) -> tuple[Port, ...]:
     """
     if model.structure.foreign:
         return ()
-    base = [c for c in model.components if c.gain is None]
-    fitted = [p for c in base for p in c.parameters if p.fitted]
+    fitted = [p for c in model.base for p in c.parameters if p.fitted]
     return tuple(Port("parameter", p.name, _si(p.unit)) for p in fitted)
 
 
@@ -136,14 +127,12 @@ def kinematic(component: Component) -> Mapping[str, Mapping[str, float]]:
 
 def kinematics(model: Model) -> dict[str, Mapping[str, float]]:
     """Return the `kinematic` intermediates of a model's base physics."""
-    base = [c for c in model.components if c.gain is None]
-    return {n: parts for c in base for n, parts in kinematic(c).items()}
+    return {n: parts for c in model.base for n, parts in kinematic(c).items()}
 
 
 def definition_of(model: Model, state: str) -> str | None:
     """Return the state, input or kinematic intermediate that a state's rate is, None of physics."""
-    base = [c for c in model.components if c.gain is None]
-    rate = next(ca.SX(written(c).der[state]) for c in base if state in written(c).der)
+    rate = next(ca.SX(written(c).der[state]) for c in model.base if state in written(c).der)
     known = (*model.state_names, *model.input_names, *kinematics(model))
     return str(rate.name()) if rate.is_symbolic() and rate.name() in known else None
 
@@ -173,9 +162,8 @@ def seen_by(model: Model, port: Port) -> tuple[str, ...]:
 
     Those of a rate include its state.
     """
-    base, kept = [c for c in model.components if c.gain is None], kinematics(model)
-    terms: dict[str, list[Expression]] = {}
-    for c in base:
+    kept, terms = kinematics(model), dict[str, list[Expression]]()
+    for c in model.base:
         for group in (written(c).add, written(c).der):
             for name, term in group.items():
                 terms.setdefault(name, []).append(term)

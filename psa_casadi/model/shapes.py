@@ -1,4 +1,7 @@
-"""What components are made of: smooth signs, plays, a bent curve; parameters and states."""
+"""What components are made of: smooth signs, plays, a bent curve; parameters, states, usual sizes.
+
+The sizes are those of the signals of a stack, from its parameter values.
+"""
 
 import math
 from collections.abc import Sequence
@@ -8,8 +11,79 @@ from typing import Any
 import casadi as ca
 
 from psa_casadi.model.component import Expression, Symbols
-from psa_casadi.model.scales import stop_scale, stroke_scale, voltage_scale
-from psa_casadi.model.variables import Nominal, Parameter, State
+from psa_casadi.model.variables import Nominal, Parameter, State, Values
+
+
+def voltage_scale(p: Values) -> float:
+    """Rated voltage span `u_rated` [V]."""
+    return abs(p["u_rated"])
+
+
+def stop_scale(p: Values) -> float:
+    """Usual size of a stop element of the hysteresis, a tenth of the rated voltage [V]."""
+    return 0.1 * voltage_scale(p)
+
+
+def force_scale(p: Values) -> float:
+    """Force at rated voltage, `k_L u_rated` [N]."""
+    return abs(p["k_L"]) * voltage_scale(p)
+
+
+def hysteresis_scale(p: Values) -> float:
+    """Usual size of a hysteresis force, a tenth of the force at rated voltage [N]."""
+    return 0.1 * abs(p["k_L"]) * abs(p["u_rated"])
+
+
+def stiffness_scale(p: Values) -> float:
+    """Series stiffness of wafers and bonding layers, or the single stiffness [N/m]."""
+    if "k_B" in p:
+        return p["k_P"] * p["k_B"] / (p["k_P"] + p["k_B"])
+    return p["k"]
+
+
+def stroke_scale(p: Values) -> float:
+    """Free stroke at rated voltage [m]."""
+    return force_scale(p) / stiffness_scale(p)
+
+
+def reading_scale(p: Values) -> float:
+    """An ordinary error of a reading, a thousandth of the stroke [m]."""
+    return 1e-3 * stroke_scale(p)
+
+
+def velocity_scale(p: Values) -> float:
+    """Stroke times the lowest natural angular frequency [m/s]."""
+    if "k_B" in p:
+        omega = min(math.sqrt(p["k_P"] / p["m_P"]), math.sqrt(p["k_B"] / p["m_B"]))
+    else:
+        omega = math.sqrt(p["k"] / p["m"])
+    return stroke_scale(p) * omega
+
+
+def current_scale(p: Values) -> float:
+    """Charging current at one rated voltage span per millisecond [A]."""
+    return p["C_p"] * voltage_scale(p) / 1e-3
+
+
+def charge_scale(p: Values) -> float:
+    """Charge at rated voltage, `C_p u_rated` [C]."""
+    return p["C_p"] * voltage_scale(p)
+
+
+def static_stiffness(s: Symbols) -> Expression:
+    """Return the static stiffness from free force to displacement [N/m].
+
+    The cascade's wafers and bonding layers in series, k_P k_B / (k_P + k_B), or the single k.
+    """
+    if hasattr(s, "k_B"):
+        return s.k_P * s.k_B / (s.k_P + s.k_B)
+    return s.k
+
+
+def stroke(s: Symbols) -> Expression:
+    """Return the linear free stroke at rated voltage, k_L u_rated / static stiffness [m]."""
+    return s.k_L * s.u_rated / static_stiffness(s)
+
 
 #: Exponent of the smooth stop; 2 bends gently, infinity is the ideal stop operator.
 _SHARPNESS = 4.0
@@ -221,6 +295,16 @@ def positive(
 ) -> Parameter:
     """Return a parameter that spans decades; `limit` as in `Parameter`."""
     return Parameter(name, value, unit, bounds, description, log=True, limit=limit)
+
+
+def reading(name: str, description: str) -> Parameter:
+    """Return the size of an error of a reading [m]."""
+    return Parameter(name, 0.0, "m", (-1e-3, 1e-3), description, "um", scale=reading_scale)
+
+
+def delay(name: str, description: str) -> Parameter:
+    """Return a delay or lag [s] that is a gain: 0 removes it."""
+    return Parameter(name, 0.0, "s", (0.0, 0.1), description, "ms", scale=1e-4)
 
 
 def form(name: str, description: str) -> Parameter:

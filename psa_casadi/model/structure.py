@@ -201,6 +201,10 @@ class Structure:
         return ca.Function("g", [self.time, self.x, self.u, self.p, self.z], [self.znext])
 
 
+#: The columns of symbols, and the variables in each.
+_COLUMNS = {"p": "parameters", "x": "states", "z": "sampled", "u": "inputs"}
+
+
 @cache
 @in_turn
 def structure_of(components: tuple[Component, ...]) -> Structure:
@@ -210,11 +214,11 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     declares what it does not give, a loop among the balances, and for sampled components of
     different periods, or of a period that is no parameter or can be 0.
     """
-    parameters, states, sampled, inputs, outputs = (
-        tuple(v for c in components for v in getattr(c, kind))
-        for kind in ("parameters", "states", "sampled", "inputs", "outputs")
-    )
-    names = [v.name for v in (*parameters, *states, *sampled, *inputs)]
+    variables: dict[str, Any] = {
+        kind: tuple(v for c in components for v in getattr(c, kind))
+        for kind in (*_COLUMNS.values(), "outputs")
+    }
+    names = [v.name for kind in _COLUMNS.values() for v in variables[kind]]
     refuse_duplicates(components, names)
     period = sample_period(components)
     table = {n: ca.SX.sym(n) for n in (*names, "time")}
@@ -239,41 +243,33 @@ def structure_of(components: tuple[Component, ...]) -> Structure:
     def resolved(expressions: Iterable[Expression]) -> Expression:
         return ca.substitute(_column(expressions), by, instead)
 
-    x = _column(table[s.name] for s in states)
-    xdot = resolved(der[s.name] for s in states)
+    columns = {k: _column(table[v.name] for v in variables[kind]) for k, kind in _COLUMNS.items()}
+    xdot = resolved(der[s.name] for s in variables["states"])
     if "displacement" in balances and "velocity" not in out:
         moved = full[list(sums).index("displacement")]
-        out["velocity"] = ca.jtimes(moved, x, xdot) + ca.jacobian(moved, table["time"])
+        out["velocity"] = ca.jtimes(moved, columns["x"], xdot) + ca.jacobian(moved, table["time"])
     return Structure(
         components=components,
-        parameters=parameters,
-        states=states,
-        inputs=inputs,
-        outputs=outputs,
+        **variables,
+        **columns,
         time=table["time"],
-        x=x,
-        u=_column(table[i.name] for i in inputs),
-        p=_column(table[q.name] for q in parameters),
         symbols={**table, **sums},
         balances=balances,
         sums=dict(zip(sums, full, strict=True)),
         der=der,
         out=out,
         xdot=xdot,
-        y=resolved(out[o.name] for o in outputs),
+        y=resolved(out[o.name] for o in variables["outputs"]),
         switches=dict(zip(switches, ca.vertsplit(resolved(switches.values())), strict=True)),
-        sampled=sampled,
         period=period,
-        z=_column(table[s.name] for s in sampled),
         next=following,
-        znext=resolved(following[s.name] for s in sampled),
+        znext=resolved(following[s.name] for s in variables["sampled"]),
     )
 
 
 def _balance_table(components: tuple[Component, ...]) -> dict[str, Balance]:
     """Return the sums of every model whose names are no symbols, and those of the components."""
-    groups = ("parameters", "states", "sampled", "inputs")
-    symbols = {v.name for c in components for kind in groups for v in getattr(c, kind)}
+    symbols = {v.name for c in components for k in _COLUMNS.values() for v in getattr(c, k)}
     shared = {n: b for n, b in BALANCES.items() if n not in symbols}
     return shared | {b.name: b for c in components for b in c.balances}
 

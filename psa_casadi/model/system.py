@@ -66,132 +66,119 @@ def connect(
     sources, a wire between units that differ, periods that differ, and a loop of outputs that
     follow their inputs at once, which it names.
     """
-    plan = _plan_of(parts, wires, inputs, outputs)
-    wiring = _Wiring(parts, plan)
+    wiring = _Wiring(parts, wires, inputs, outputs)
     components = [wiring.component(part) for part in parts]
     table = {f"{part}_{n}": v for part, model in parts.items() for n, v in model.values.items()}
     values = {p.name: table[p.name] for c in components for p in c.parameters}
     return compose(components, values, name=name, description=description)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Which output feeds each wired input; names outside by port; the parameter of the period."""
-
-    sources: Mapping[Port, Port]
-    inputs: Mapping[Port, str]
-    outputs: Mapping[Port, str]
-    period: str | None
-
-
-def _plan_of(
-    parts: Mapping[str, Model],
-    wires: Sequence[tuple[str, str]],
-    inputs: Mapping[str, str] | None,
-    outputs: Mapping[str, str] | None,
-) -> _Plan:
-    """Check wires and names outside, names, units and periods; return what they say."""
-    problems = Problems()
-    for name in (*parts, *(inputs or ()), *(outputs or ())):
-        if not is_identifier(name):
-            problems.add(
-                f"'{name}' cannot name a part or a port; use letters, digits, underscores, no digit"
-                " first."
-            )
-    sources: dict[Port, Port] = {}
-    for start, end in wires:
-        feeding, taking = (_port(parts, q, problems) for q in ((start, "output"), (end, "input")))
-        if feeding is None or taking is None:
-            continue
-        (source, fed), (target, taken) = feeding, taking
-        if target in sources:
-            problems.add(
-                f"The input '{end}' has two sources, '{'.'.join(sources[target])}' and '{start}';"
-                " leave one out."
-            )
-        one, other = parse_unit(fed.unit), parse_unit(taken.unit)
-        if (one.dimension, one.ratio, one.offset) != (other.dimension, other.ratio, other.offset):
-            problems.add(
-                f"The wire from '{start}' [{fed.unit}] to '{end}' [{taken.unit}] joins"
-                " different units; wire ports of one unit, or put a part between them."
-            )
-        sources[target] = source
-    named = (
-        _named(parts, "input", inputs, sources, problems),
-        _named(parts, "output", outputs, {}, problems),
-    )
-    periods = {
-        f"{name}_{q}": model.values[q]
-        for name, model in parts.items()
-        if (q := model.structure.period) is not None
-    }
-    if len(set(periods.values())) > 1:
-        listed = ", ".join(f"{name} = {value:g} s" for name, value in periods.items())
-        problems.add(f"The sampled parts have different periods: {listed}; give them one.")
-    problems.raise_if_any()
-    return _Plan(sources, *named, next(iter(periods), None))
-
-
-def _variables(model: Model, kind: str) -> tuple[Input | Output, ...]:
-    return model.structure.inputs if kind == "input" else model.structure.outputs
-
-
-def _port(
-    parts: Mapping[str, Model], text_and_kind: tuple[str, str], problems: Problems
-) -> tuple[Port, Input | Output] | None:
-    """Return a port and its variable by its text, or None after noting what is wrong with it."""
-    text, kind = text_and_kind
-    name, dot, variable = text.partition(".")
-    if name not in parts or not dot:
-        problems.add(
-            f"'{text}' names no part; write part.{kind}, the parts are {', '.join(parts)}."
-        )
-        return None
-    known = {v.name: v for v in _variables(parts[name], kind)}
-    if variable not in known:
-        listed = ", ".join(known) or "none"
-        problems.add(f"'{text}' is no {kind}; the {kind}s of '{name}' are: {listed}.")
-        return None
-    return (name, variable), known[variable]
-
-
-def _named(
-    parts: Mapping[str, Model],
-    kind: str,
-    inputs: Mapping[str, str] | None,
-    sources: Mapping[Port, Port],
-    problems: Problems,
-) -> dict[Port, str]:
-    """Return the names outside of the inputs or outputs that have one; one name each."""
-    if inputs is None:
-        every = [(part, v.name) for part, model in parts.items() for v in _variables(model, kind)]
-        return {port: "_".join(port) for port in every if port not in sources}
-    texts: dict[Port, str] = {}
-    for name, text in inputs.items():
-        known = _port(parts, (text, kind), problems)
-        if known is None:
-            continue
-        port, _ = known
-        other = ".".join(sources[port]) if port in sources else texts.get(port)
-        if other is not None:
-            what = "has two sources," if kind == "input" else "is named twice outside,"
-            problems.add(f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out.")
-        texts[port] = name
-    return texts
-
-
 class _Wiring:
     """The parts in symbols by their names in the system, and the outputs resolved so far.
 
-    Inputs that are fed from inside have temporary symbols until they are replaced.
+    `sources` maps each wired input to the output that feeds it, `outside` the ports with a name
+    outside to it; `period` is the parameter of the period. Inputs that are fed from inside have
+    temporary symbols until they are replaced.
     """
 
-    def __init__(self, parts: Mapping[str, Model], plan: _Plan) -> None:
-        self.models, self.plan = parts, plan
+    def __init__(
+        self,
+        parts: Mapping[str, Model],
+        wires: Sequence[tuple[str, str]],
+        inputs: Mapping[str, str] | None,
+        outputs: Mapping[str, str] | None,
+    ) -> None:
+        self.models, self.problems = parts, Problems()
+        for name in (*parts, *(inputs or ()), *(outputs or ())):
+            if not is_identifier(name):
+                self.problems.add(
+                    f"'{name}' cannot name a part or a port; use letters, digits, underscores, no"
+                    " digit first."
+                )
+        self.sources: dict[Port, Port] = {}
+        for start, end in wires:
+            self._wire(start, end)
+        self.inputs = self._named("input", inputs, self.sources)
+        self.outputs = self._named("output", outputs, {})
+        self.period = self._period()
+        self.problems.raise_if_any()
         self.symbols: dict[str, Expression] = {"time": ca.SX.sym("time")}
         self.inside: dict[Port, Expression] = {}
         self.known: dict[Port, Expression] = {}
         self.results = {name: self._renamed(name, model) for name, model in parts.items()}
+
+    def _wire(self, start: str, end: str) -> None:
+        """Lead a wire from an output to an input, both as "part.port"; note what is wrong."""
+        feeding, taking = self._port(start, "output"), self._port(end, "input")
+        if feeding is None or taking is None:
+            return
+        (source, fed), (target, taken) = feeding, taking
+        if target in self.sources:
+            self.problems.add(
+                f"The input '{end}' has two sources, '{'.'.join(self.sources[target])}' and"
+                f" '{start}'; leave one out."
+            )
+        one, other = parse_unit(fed.unit), parse_unit(taken.unit)
+        if (one.dimension, one.ratio, one.offset) != (other.dimension, other.ratio, other.offset):
+            self.problems.add(
+                f"The wire from '{start}' [{fed.unit}] to '{end}' [{taken.unit}] joins"
+                " different units; wire ports of one unit, or put a part between them."
+            )
+        self.sources[target] = source
+
+    def _period(self) -> str | None:
+        """Return the parameter of the first period; note periods that differ."""
+        periods = {
+            f"{name}_{q}": model.values[q]
+            for name, model in self.models.items()
+            if (q := model.structure.period) is not None
+        }
+        if len(set(periods.values())) > 1:
+            listed = ", ".join(f"{name} = {value:g} s" for name, value in periods.items())
+            self.problems.add(f"The sampled parts have different periods: {listed}; give them one.")
+        return next(iter(periods), None)
+
+    def _variables(self, part: str, kind: str) -> tuple[Input | Output, ...]:
+        s = self.models[part].structure
+        return s.inputs if kind == "input" else s.outputs
+
+    def _port(self, text: str, kind: str) -> tuple[Port, Input | Output] | None:
+        """Return a port and its variable by its text, or None after noting what is wrong."""
+        name, dot, variable = text.partition(".")
+        if name not in self.models or not dot:
+            self.problems.add(
+                f"'{text}' names no part; write part.{kind}, the parts are"
+                f" {', '.join(self.models)}."
+            )
+            return None
+        known = {v.name: v for v in self._variables(name, kind)}
+        if variable not in known:
+            listed = ", ".join(known) or "none"
+            self.problems.add(f"'{text}' is no {kind}; the {kind}s of '{name}' are: {listed}.")
+            return None
+        return (name, variable), known[variable]
+
+    def _named(
+        self, kind: str, names: Mapping[str, str] | None, sources: Mapping[Port, Port]
+    ) -> dict[Port, str]:
+        """Return the names outside of the inputs or outputs that have one; one name each."""
+        if names is None:
+            every = [(part, v.name) for part in self.models for v in self._variables(part, kind)]
+            return {port: "_".join(port) for port in every if port not in sources}
+        texts: dict[Port, str] = {}
+        for name, text in names.items():
+            known = self._port(text, kind)
+            if known is None:
+                continue
+            port, _ = known
+            other = ".".join(sources[port]) if port in sources else texts.get(port)
+            if other is not None:
+                what = "has two sources," if kind == "input" else "is named twice outside,"
+                self.problems.add(
+                    f"The {kind} '{text}' {what} '{other}' and '{name}'; leave one out."
+                )
+            texts[port] = name
+        return texts
 
     def _renamed(self, name: str, model: Model) -> list[Expression]:
         """Return slopes, next values, switches and outputs of a part in new symbols."""
@@ -200,12 +187,12 @@ class _Wiring:
         names += model.input_names
         for n in names:
             symbol, port = ca.SX.sym(f"{name}_{n}"), (name, n)
-            if n in model.input_names and port not in self.plan.inputs:
+            if n in model.input_names and port not in self.inputs:
                 new.append(self.inside.setdefault(port, symbol))
                 continue
-            outside = self.plan.inputs.get(port) or f"{name}_{n}"
-            if n == s.period and self.plan.period is not None:
-                outside = self.plan.period
+            outside = self.inputs.get(port) or f"{name}_{n}"
+            if n == s.period and self.period is not None:
+                outside = self.period
             new.append(self.symbols.setdefault(outside, symbol))
         results = [s.xdot, s.znext, ca.vertcat(ca.SX(0, 1), *s.switches.values()), s.y]
         expressions: list[Expression] = ca.substitute(
@@ -219,7 +206,7 @@ class _Wiring:
         Its inputs are replaced by what feeds them. Raises InputError for a loop of outputs that
         follow their inputs at once.
         """
-        model, plan = self.models[name], self.plan
+        model = self.models[name]
         s = model.structure
         places = {"der": model.state_names, "next": model.sampled_names, "switches": s.switches}
         whole = self._wired(name, ca.vertcat(*self.results[name][:3]), ())
@@ -227,7 +214,7 @@ class _Wiring:
         values = {k: {f"{name}_{n}": next(elements) for n in names} for k, names in places.items()}
         table = {n: self.output((name, n), ()) for n in model.output_names}
         values["out"] = {
-            plan.outputs[q]: e for n, e in table.items() if (q := (name, n)) in plan.outputs
+            self.outputs[q]: e for n, e in table.items() if (q := (name, n)) in self.outputs
         }
         before = list(self.symbols.values())
 
@@ -249,16 +236,16 @@ class _Wiring:
             source=sources,
             equation_text=";  ".join(c.equation_text for c in model.components if c.equation_text),
             equations=equations,
-            sample_period=plan.period if s.sampled else None,
+            sample_period=self.period if s.sampled else None,
             **self._declared(name, model),
         )
 
     def _declared(self, name: str, model: Model) -> dict[str, Any]:
         """Return the variables of a part as they are named in the system, by kind."""
-        s, plan = model.structure, self.plan
+        s = model.structure
         places = {n: f"{name}_{n}" for n in model.parameter_names}
-        if s.period is not None and plan.period is not None:
-            places[s.period] = plan.period
+        if s.period is not None and self.period is not None:
+            places[s.period] = self.period
 
         def renamed(variable: Any, **size: Any) -> Any:
             text = f"{name}: {variable.description}"
@@ -278,12 +265,12 @@ class _Wiring:
             "parameters": tuple(
                 renamed(p, scale=None if p.scale is None else size(p.scale))
                 for p in s.parameters
-                if p.name != s.period or plan.period == f"{name}_{p.name}"
+                if p.name != s.period or self.period == f"{name}_{p.name}"
             ),
             "states": tuple(renamed(v, nominal=size(v.nominal)) for v in s.states),
             "sampled": tuple(renamed(v, nominal=size(v.nominal)) for v in s.sampled),
-            "inputs": named(s.inputs, plan.inputs),
-            "outputs": named(s.outputs, plan.outputs),
+            "inputs": named(s.inputs, self.inputs),
+            "outputs": named(s.outputs, self.outputs),
         }
 
     def output(self, port: Port, path: tuple[Port, ...]) -> Expression:
@@ -308,7 +295,7 @@ class _Wiring:
             if symbol is None or not ca.depends_on(expression, symbol):
                 continue
             symbols.append(symbol)
-            source = self.plan.sources.get((name, it.name))
+            source = self.sources.get((name, it.name))
             feeding.append(ca.SX(it.start) if source is None else self.output(source, path))
         return ca.substitute([expression], symbols, feeding)[0]
 

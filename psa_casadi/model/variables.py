@@ -1,5 +1,6 @@
 """The words of every model: parameters, states, inputs and outputs, named as FMI names them."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import NamedTuple
@@ -56,7 +57,7 @@ class State:
     name: str
     unit: str
     description: str
-    nominal: Nominal
+    nominal: Nominal = 1.0
     start: float = 0.0
     display_unit: str | None = None
     memory: bool = False
@@ -87,11 +88,24 @@ class Output:
     display_unit: str | None = None
 
 
+#: Half the width of a 95 % interval over the standard error.
+NORMAL_95 = 1.959963984540054
+
+
 class Interval(NamedTuple):
     """An estimate's 95 % confidence interval, in the unit of the parameter."""
 
     low: float
     high: float
+
+    @classmethod
+    def of(cls, parameter: Parameter, value: float, error: float) -> "Interval":
+        """Return the interval of an estimate; one on a logarithmic scale lies within a factor."""
+        half = NORMAL_95 * error
+        if parameter.log and value > 0.0:
+            factor = math.exp(min(half / value, 50.0))
+            return cls(value / factor, value * factor)
+        return cls(value - half, value + half)
 
 
 @dataclass(frozen=True)

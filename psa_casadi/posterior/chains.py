@@ -79,7 +79,7 @@ def predictive(
         try:
             parts = predict(
                 task.model, task.experiments, task.unknowns, theta,
-                way=task.way, everything=True, differentiated=False,
+                way=task.fit.way, everything=True, differentiated=False,
                 further=any(b.channel for b in blocks),
             )  # fmt: skip
         except PsaError:

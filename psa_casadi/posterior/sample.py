@@ -155,7 +155,7 @@ def doubts_of(task: Task, chains: Chains, figures: tuple[Figures, ...]) -> tuple
     few = [f.name for f in figures if f.ess < LEAST_ESS * count]
     if few:
         doubts.append(note("few_draws", names=few, limit=LEAST_ESS))
-    if not task.converged:
+    if not task.fit.converged:
         doubts.append(note("start_cut_off"))
     for b in task.density.blocks:
         if b.correlation_time > _COLOURED:
@@ -248,7 +248,7 @@ def sample(
     figures = figures_of(task, tree)
     failed = [note("prior_fails", count=before.failed, draws=_PREDICTED)] if before.failed else []
     return Posterior(
-        model=task.model.with_values(task.unknowns.values(task.theta)),
+        model=task.model.with_values(task.unknowns.values(task.fit.theta)),
         tree=tree,
         figures=figures,
         divergences=result.divergences,
@@ -271,7 +271,7 @@ def _refuse(model: Model, chains: int, draws: int, tune: int, words: Iterable[st
     for word in words:
         if word not in _OWN or is_stack(model):
             problems.add(
-                f"'{word}' is not among the words for the model '{model.name}'; of a model of your"
+                f"'{word}' is not among the arguments for '{model.name}'; of a model of your"
                 f" own there are also {', '.join(_OWN)}."
             )
     if chains < 1 or draws < 4 or tune < 1:

@@ -1,7 +1,7 @@
 """What is sampled: the records as a fit has them, the priors, the fit, and the density there."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,27 +9,19 @@ import numpy as np
 from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.common.notes import Note
 from psa_casadi.common.units import BoolArray, FloatArray
-from psa_casadi.identification.fitting.fit import (
-    Fit,
-    Objective,
-    accurate_minimum,
-    unknowns_around,
-    weights_of,
-)
-from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate, Minimum
-from psa_casadi.identification.fitting.prediction import further_of, predict
+from psa_casadi.identification.fitting.fit import Fit, Objective, fit_from, unknowns_around
+from psa_casadi.identification.fitting.levenberg_marquardt import Evaluate
 from psa_casadi.identification.fitting.unknowns import Unknowns
 from psa_casadi.identification.multistart import free_of
 from psa_casadi.identification.own_model import identify_ode
 from psa_casadi.identification.prepare import columns_of, prepared, with_levels
-from psa_casadi.identification.refitting import noise_levels, weighted
+from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.identification.search import free_parameters
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import autocovariance
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Channel, Experiment, whole, without_gaps
-from psa_casadi.simulation.simulate import Way
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,35 +36,32 @@ class Within:
     high: FloatArray
 
     @property
+    def _cases(self) -> list[BoolArray]:
+        """Which coordinates have two bounds, a lower one (first of these cases), an upper one."""
+        below, above = np.isfinite(self.low), np.isfinite(self.high)
+        return [below & above, below, above]
+
+    @property
     def bounded(self) -> BoolArray:
         """Which coordinates have a bound (size,)."""
         return np.isfinite(self.low) | np.isfinite(self.high)
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Return z (size,) of a theta strictly within the bounds."""
-        below, above = np.isfinite(self.low), np.isfinite(self.high)
-        from_low, to_high = theta - self.low, self.high - theta
-        with np.errstate(all="ignore"):  # of the branches that are not taken
-            return np.where(
-                below & above,
-                np.log(from_low) - np.log(to_high),
-                np.where(below, np.log(from_low), np.where(above, np.log(to_high), theta)),
-            )
+        with np.errstate(all="ignore"):  # of the cases that do not hold
+            from_low, to_high = np.log(theta - self.low), np.log(self.high - theta)
+            return np.select(self._cases, [from_low - to_high, from_low, to_high], theta)
 
     def theta(self, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return theta, d theta / d z and d ln |d theta / d z| / d z, each (size,)."""
-        below, above = np.isfinite(self.low), np.isfinite(self.high)
-        share = 0.5 * (1.0 + np.tanh(0.5 * z))
+        share, one, low, high = 0.5 * (1.0 + np.tanh(0.5 * z)), np.ones_like(z), self.low, self.high
         with np.errstate(over="ignore", invalid="ignore"):
-            size, grown = self.high - self.low, np.exp(z)
-            both, one = below & above, below ^ above
-            theta = np.where(both, self.low + size * share, z)
-            theta = np.where(one & below, self.low + grown, theta)
-            theta = np.where(one & above, self.high - grown, theta)
-            slope = np.where(both, size * share * (1.0 - share), 1.0)
-            slope = np.where(one, np.where(below, grown, -grown), slope)
-        bend = np.where(both, 1.0 - 2.0 * share, np.where(one, 1.0, 0.0))
-        return theta, slope, bend
+            size, grown = high - low, np.exp(z)
+            inside = [low + size * share, low + grown, high - grown]
+            slopes = [size * share * (1.0 - share), grown, -grown]
+        bends = [1.0 - 2.0 * share, one, one]
+        theta, slope = np.select(self._cases, inside, z), np.select(self._cases, slopes, 1.0)
+        return theta, slope, np.select(self._cases, bends, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,19 +143,26 @@ _TAIL = 0.1
 class Task:
     """A posterior to sample: `density` in u, and the fit that it is centred on.
 
-    `theta` (size,) are the coordinates of the fit, `covariance` theirs, white residuals assumed.
-    `sentences` are what was done to the records.
+    `model` has the values that the priors are centred at; the experiments of the fit and its sigma
+    have the levels that its residuals suggest. `covariance` (size, size) is that of the fit's
+    coordinates, white residuals assumed. `sentences` are what was done to the records.
     """
 
     model: Model
-    experiments: tuple[Experiment, ...]
-    unknowns: Unknowns
+    fit: Fit
     density: Density
-    theta: FloatArray
     covariance: FloatArray
-    way: Way
-    converged: bool
     sentences: tuple[Note | str, ...]
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The records as they were fitted."""
+        return self.fit.experiments
+
+    @property
+    def unknowns(self) -> Unknowns:
+        """The coordinates of the fit."""
+        return self.fit.unknowns
 
     def of_record(self, record: int) -> tuple[Block, ...]:
         """Return the blocks of one record, that of the first channel foremost."""
@@ -230,7 +226,7 @@ def own_task_of(
     declared = {n: fitted.parameter(n).value for n in names}
     return _around(
         fitted.with_values({**declared, **(prior or {})}),
-        weighted(identification.fit, identification.experiments),
+        identification.experiments,
         {n: fitted.values[n] for n in names},
         widths or {},
         identification.fit.sigma,
@@ -241,7 +237,7 @@ def own_task_of(
 
 def _around(
     centre: Model,
-    experiments: Sequence[Experiment],
+    experiments: tuple[Experiment, ...],
     values: Mapping[str, float],
     widths: Mapping[str, float],
     sigma: Sequence[float],
@@ -264,23 +260,19 @@ def _around(
         start, offset = (fit.start(r), fit.offset(r)) if fit else ({}, 0.0)
         unknowns.place(theta, r, start, offset)
     for _ in range(_ROUNDS):  # levels of records and of columns that the residuals suggest
-        result, way, _ = accurate_minimum(
+        result = fit_from(
             centre, experiments, unknowns, theta, sigma,
             tolerance=_TOLERANCE, evaluations=_EVALUATIONS,
         )  # fmt: skip
         if result.interrupted:
             raise KeyboardInterrupt
-        theta, weights = result.theta, weights_of(experiments, sigma)
-        ends = np.cumsum([e.at(0).sum() for e in experiments])
-        residuals = np.split(result.residual[: len(weights)] * weights, ends[:-1])
+        theta, levels = result.theta, [f.relevelled() for f in result.further]
         sigma = [
             max(float(np.sqrt(np.mean(r**2))), 1e-15) if r.size else s
-            for r, s in zip(residuals, sigma, strict=True)
+            for r, s in zip(result.record_residuals, sigma, strict=True)
         ]
-        predictions = predict(centre, experiments, unknowns, theta, way=way, further=True)
-        levels = [f.relevelled() for f in further_of(experiments, predictions)]
         experiments = tuple(e.with_further(levels) for e in experiments)
-    return _task(centre, tuple(experiments), unknowns, result, way, sigma, sentences)
+    return _task(centre, replace(result, experiments=experiments, sigma=tuple(sigma)), sentences)
 
 
 def _refuse(model: Model, names: Sequence[str], values: Mapping[str, float]) -> None:
@@ -318,18 +310,10 @@ def _centres(
     return {**centre, **values}
 
 
-def _task(
-    model: Model,
-    experiments: tuple[Experiment, ...],
-    unknowns: Unknowns,
-    minimum: Minimum,
-    way: Way,
-    sigma: Sequence[float],
-    sentences: tuple[Note | str, ...],
-) -> Task:
-    evaluate = Objective(model, experiments, unknowns, sigma, way)
-    low, high = unknowns.bounds()
-    again = evaluate(minimum.theta)
+def _task(model: Model, fit: Fit, sentences: tuple[Note | str, ...]) -> Task:
+    experiments, unknowns = fit.experiments, fit.unknowns
+    evaluate = Objective(model, experiments, unknowns, fit.sigma, fit.way)
+    again = evaluate(fit.theta)
     if again is None:
         raise InputError("The model cannot be simulated at its fit; start from another model.")
     residual, jacobian = again
@@ -345,29 +329,20 @@ def _task(
                 lags = autocovariance(part)
                 ratio = float(2.0 * np.sum(lags) / lags[0] - 1.0) if lags[0] > 0.0 else 1.0
                 time = max(1.0, ratio)
-                level = (channel.level if j else sigma[r]) * e.share(j)
+                level = (channel.level if j else fit.sigma[r]) * e.share(j)
                 level *= float(np.sqrt(np.mean(part**2)))
                 blocks.append(Block(rows, (len(part) - projected) / time, r, j, time, level))
             precision += jacobian[rows].T @ jacobian[rows] / time
     rest = jacobian[last:]
     precision += rest.T @ rest
-    within = Within(low, high)
+    within = Within(*unknowns.bounds())
     covariance: FloatArray = np.asarray(np.linalg.pinv(precision, hermitian=True))
     moving = np.ones(unknowns.size, dtype=bool)
     if not unknowns.offset_scale:  # without an unknown zero, offsets stay at 0
         moving[list(unknowns.offsets)] = False
-    centre, factor = _whitening(within, minimum.theta, precision, np.diag(covariance), moving)
-    return Task(
-        model=model,
-        experiments=experiments,
-        unknowns=unknowns,
-        density=Density(evaluate, tuple(blocks), within, centre, factor),
-        theta=minimum.theta,
-        covariance=covariance,
-        way=way,
-        converged=minimum.converged,
-        sentences=sentences,
-    )
+    centre, factor = _whitening(within, fit.theta, precision, np.diag(covariance), moving)
+    density = Density(evaluate, tuple(blocks), within, centre, factor)
+    return Task(model, fit, density, covariance, sentences)
 
 
 def _whitening(

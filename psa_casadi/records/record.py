@@ -1,9 +1,8 @@
 """One experiment: its columns, what must hold for their numbers, and the record of them."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -25,7 +24,8 @@ LISTED = 20
 class Located:
     """One column's values, where they stand, and which of them were reported already.
 
-    Value k is in `place` number `lines[k]` of the file: a "line" of text, a "row" of a table.
+    Value k is in `place` number `lines[k]` of the file: a "line" of text, a "row" of a table. What
+    the checks find is added to `problems`.
     """
 
     path: str
@@ -33,99 +33,79 @@ class Located:
     values: FloatArray
     lines: IndexArray
     reported: BoolArray
-    place: str = "line"
+    place: str
+    problems: Problems
 
     def part(self, where: slice) -> "Located":
         """Return some of the values."""
         parts = {n: getattr(self, n)[where] for n in ("values", "lines", "reported")}
         return replace(self, **parts)
 
-
-def check_length(path: str, samples: int, problems: Problems) -> None:
-    """Demand at least `FEWEST_SAMPLES` samples."""
-    if samples >= FEWEST_SAMPLES:
-        return
-    more = "record for longer" if samples else "fill the rows below its header"
-    problems.add(
-        f"{path}: found {samples} samples, expected at least {FEWEST_SAMPLES}; {more}, or name the"
-        " right file."
-    )
-
-
-def check_time(time: Located, problems: Problems) -> None:
-    """Demand finite instants, each later than the one before it."""
-    check_finite(time, problems, complete=True)
-    known = np.flatnonzero(np.isfinite(time.values))
-    wrong = np.flatnonzero(np.diff(time.values[known]) <= 0)
-    if wrong.size > LISTED:
-        first, places = known[wrong[0] + 1], f"{time.place}s"
-        advices = (time.values[known[wrong]] == time.values[known[wrong + 1]]).all()
-        what = f": the {places} are not in the order of time; sort them by it."
-        what = f": their time stands still; remove repeated {places}." if advices else what
-        problems.add(
-            f"{time.path}: column 'time': {wrong.size} of {time.values.size} {places} are not later"
-            f" than the one before, {time.place} {time.lines[first]} the first of them{what}"
-        )
-        return
-    for row, before in zip(known[wrong + 1], known[wrong], strict=True):
-        now, last = time.values[row], time.values[before]
-        what = "stands still" if now == last else "goes back"
-        problems.add(
-            f"{time.path}: {time.place} {time.lines[row]}, column 'time': time {what} (from "
-            f"{last:.9g} in {time.place} {time.lines[before]} to {now:.9g}), expected a later "
-            f"instant in every {time.place}; remove repeated {time.place}s or split the file where "
-            f"a new record begins."
-        )
-
-
-def check_displacement(column: Located, problems: Problems) -> None:
-    """Demand finite numbers, of which enough are there; missing ones are allowed."""
-    check_finite(column, problems)
-    valid = int(np.isfinite(column.values).sum())
-    if column.values.size >= FEWEST_SAMPLES > valid:
-        problems.add(
-            f"{column.path}: column 'displacement': found {valid or 'no'} valid values in "
-            f"{column.values.size} rows, expected at least {FEWEST_SAMPLES}; check that the sensor "
-            f"was recorded."
-        )
-
-
-def check_excitation(column: Located, problems: Problems) -> None:
-    """Demand a voltage that changes."""
-    finite = column.values[np.isfinite(column.values)]
-    if finite.size and np.ptp(finite) <= 1e-12 * np.max(np.abs(finite)):
-        problems.add(
-            f"{column.path}: column 'voltage': found {finite[0]:.6g} in every row, expected a "
-            f"voltage that changes; a fit needs a record in which the stack is driven."
-        )
-
-
-def check_finite(column: Located, problems: Problems, *, complete: bool = False) -> None:
-    """Demand measured numbers where there are any, in every row if the column is to be `complete`.
-
-    What was reported already is not reported again.
-    """
-    values, place = column.values, column.place
-    for at, text in (
-        (np.isnan(values) & complete, "found no value, expected a number; fill"),
-        (np.isinf(values), "found {}, expected a finite number; correct"),
-        (
-            np.isfinite(values) & (np.abs(values) > LARGEST),
-            f"found {{}}, expected a measured number, below {LARGEST:g}; correct",
-        ),
-    ):
-        rows = np.flatnonzero(at & ~column.reported)
-        for row in rows[:LISTED]:
-            problems.add(
-                f"{column.path}: {place} {column.lines[row]}, column '{column.name}':"
-                f" {text.format(f'{values[row]:.6g}')} the cell or remove the {place}."
+    def check_time(self) -> None:
+        """Demand finite instants, each later than the one before it."""
+        self.check_finite(complete=True)
+        values, lines, place = self.values, self.lines, self.place
+        known = np.flatnonzero(np.isfinite(values))
+        wrong = np.flatnonzero(np.diff(values[known]) <= 0)
+        if wrong.size > LISTED:
+            first, stands = known[wrong[0] + 1], values[known[wrong]] == values[known[wrong + 1]]
+            what = f": the {place}s are not in the order of time; sort them by it."
+            what = f": their time stands still; remove repeated {place}s." if stands.all() else what
+            self.problems.add(
+                f"{self.path}: column 'time': {wrong.size} of {values.size} {place}s are not later"
+                f" than the one before, {place} {lines[first]} the first of them{what}"
             )
-        problems.add_uncounted(max(0, rows.size - LISTED))
+            return
+        for row, before in zip(known[wrong + 1], known[wrong], strict=True):
+            now, last = values[row], values[before]
+            what = "stands still" if now == last else "goes back"
+            self.problems.add(
+                f"{self.path}: {place} {lines[row]}, column 'time': time {what} (from {last:.9g} in"
+                f" {place} {lines[before]} to {now:.9g}), expected a later instant in every"
+                f" {place}; remove repeated {place}s or split the file where a new record begins."
+            )
 
+    def check_displacement(self) -> None:
+        """Demand finite numbers, of which enough are there; missing ones are allowed."""
+        self.check_finite()
+        valid = int(np.isfinite(self.values).sum())
+        if self.values.size >= FEWEST_SAMPLES > valid:
+            self.problems.add(
+                f"{self.path}: column 'displacement': found {valid or 'no'} valid values in"
+                f" {self.values.size} rows, expected at least {FEWEST_SAMPLES}; check that the"
+                " sensor was recorded."
+            )
 
-Check = Callable[[Located, Problems], None]
-#: Demand a finite number in every row.
-check_complete: Check = partial(check_finite, complete=True)
+    def check_excitation(self) -> None:
+        """Demand a voltage that changes."""
+        finite = self.values[np.isfinite(self.values)]
+        if finite.size and np.ptp(finite) <= 1e-12 * np.max(np.abs(finite)):
+            self.problems.add(
+                f"{self.path}: column 'voltage': found {finite[0]:.6g} in every row, expected a"
+                " voltage that changes; a fit needs a record in which the stack is driven."
+            )
+
+    def check_finite(self, *, complete: bool = False) -> None:
+        """Demand measured numbers where there are any, in every row if it is to be `complete`.
+
+        What was reported already is not reported again.
+        """
+        values, place = self.values, self.place
+        for at, text in (
+            (np.isnan(values) & complete, "found no value, expected a number; fill"),
+            (np.isinf(values), "found {}, expected a finite number; correct"),
+            (
+                np.isfinite(values) & (np.abs(values) > LARGEST),
+                f"found {{}}, expected a measured number, below {LARGEST:g}; correct",
+            ),
+        ):
+            rows = np.flatnonzero(at & ~self.reported)
+            for row in rows[:LISTED]:
+                self.problems.add(
+                    f"{self.path}: {place} {self.lines[row]}, column '{self.name}':"
+                    f" {text.format(f'{values[row]:.6g}')} the cell or remove the {place}."
+                )
+            self.problems.add_uncounted(max(0, rows.size - LISTED))
 
 
 @dataclass(frozen=True)
@@ -213,10 +193,12 @@ class Record(Signals):
         object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "units", {**units, "displacement": self.displacement_unit})
         numbers, unreported = np.arange(self.n, dtype=np.int64), np.zeros(self.n, dtype=np.bool_)
-        checks: dict[str, Check] = {"time": check_time, "displacement": check_finite}
         for column, values in {"time": self.time, **columns}.items():
-            located = Located(where, column, values, numbers, unreported, "sample")
-            checks.get(column, check_complete)(located, problems)
+            located = Located(where, column, values, numbers, unreported, "sample", problems)
+            if column == "time":
+                located.check_time()
+            else:
+                located.check_finite(complete=column != "displacement")
         problems.raise_if_any()
         if not self.sha256:
             digest = hashlib.sha256()

@@ -1,6 +1,6 @@
 """The noise of a record without any model: from voltages played twice, and from held voltages."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
@@ -160,30 +160,19 @@ class MeasuredNoise:
 
     `autocovariance` (lags,) [m^2] starts at lag 0. `autoregression` (p,) holds a_1 ... a_p of
     e_k = a_1 e_(k-1) + ... + w_k by Yule and Walker, p chosen by Schwarz' criterion, empty if
-    white. `samples` is the number of samples it rests on.
+    white. `samples` is the number of samples it rests on: of repeats `distances` [s] apart, or of
+    `holds` held voltages.
     """
 
     level: float
     autocovariance: FloatArray
     autoregression: FloatArray
     samples: int
+    distances: tuple[float, ...] = ()
+    holds: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Repeats(MeasuredNoise):
-    """Noise from repeats, `distances` [s] apart."""
-
-    distances: tuple[float, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Holds(MeasuredNoise):
-    """Noise from `count` held voltages."""
-
-    count: int
-
-
-def repeats(record: Record) -> Repeats | None:
+def repeats(record: Record) -> MeasuredNoise | None:
     """Return the noise that differs between two plays of the same voltage, None without any.
 
     With y = s + e, s repeated: y(t + T) - y(t) has the autocovariance 2 c(k) for noise that forgets
@@ -205,12 +194,10 @@ def repeats(record: Record) -> Repeats | None:
             pieces.append(_without_drift(change, apart, r.lag))
     apart_s = {r.lag: float(record.time[r.start + r.lag] - record.time[r.start]) for r in plays}
     noise = _pooled(pieces, 0.5, len(apart_s))
-    if noise is None:
-        return None
-    return Repeats(*noise, tuple(apart_s.values()))
+    return None if noise is None else replace(noise, distances=tuple(apart_s.values()))
 
 
-def holds(record: Record) -> Holds | None:
+def holds(record: Record) -> MeasuredNoise | None:
     """Return the noise around a smooth creep a + b t + c t^2 + d ln t while the voltage is held.
 
     The first quarter of every hold is left to transients, and more while it still rings: as long
@@ -231,7 +218,7 @@ def holds(record: Record) -> Holds | None:
                 break
             t, y = t[d.size // 2 :], y[d.size // 2 :]
     noise = _pooled(pieces, 1.0, 1)
-    return None if noise is None else Holds(*noise, len(pieces))
+    return None if noise is None else replace(noise, holds=len(pieces))
 
 
 def _without_creep(t: FloatArray, y: FloatArray) -> FloatArray | None:
@@ -268,10 +255,8 @@ def _without_drift(change: FloatArray, apart: FloatArray, lag: int) -> tuple[Flo
     return change - x @ coefficients, intervals + 1 + (scale > 0)
 
 
-def _pooled(
-    pieces: list[tuple[FloatArray, int]], share: float, uses: int
-) -> tuple[float, FloatArray, FloatArray, int] | None:
-    """Return level, autocovariance, autoregression and number of samples of remainders.
+def _pooled(pieces: list[tuple[FloatArray, int]], share: float, uses: int) -> MeasuredNoise | None:
+    """Return the noise of remainders.
 
     c(k) = share * mean(d_i d_(i+k)) over all pieces, enlarged for the coefficients removed. The
     pieces use every sample `uses` times.
@@ -288,12 +273,13 @@ def _pooled(
     lags = int(np.argmin(pairs >= 0.25 * FEWEST)) or lags
     covariance = share * products[:lags] / pairs[:lags]
     if not covariance[0] > 0:
-        return 0.0, covariance, np.zeros(0), used // uses
+        return MeasuredNoise(0.0, covariance, np.zeros(0), used // uses)
     r = float(np.clip(covariance[min(1, lags - 1)] / covariance[0], 0.0, 0.95)) if lags > 1 else 0.0
     lost = sum(p for _, p in pieces) * (1.0 + r) / (1.0 - r)
     covariance *= used / max(used - lost, 0.5 * used)
     samples = used // uses
-    return float(np.sqrt(covariance[0])), covariance, autoregression(covariance, samples), samples
+    colour = autoregression(covariance, samples)
+    return MeasuredNoise(float(np.sqrt(covariance[0])), covariance, colour, samples)
 
 
 def autoregression_of(signal: FloatArray) -> FloatArray:

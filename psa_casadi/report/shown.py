@@ -4,6 +4,7 @@ import base64
 import io
 import os
 from collections.abc import Sequence
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,15 +14,14 @@ from psa_casadi.documents.files import AnyDiagnosisFile, DiagnosisFile
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.compose import Model
-from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Population
+from psa_casadi.population.population import Finding, Population
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import Signals
 from psa_casadi.report.page.devices import write_comparison, write_population
 from psa_casadi.report.page.document import filled
 from psa_casadi.report.page.results import write_fit_report, write_posterior, write_report
 from psa_casadi.report.plots.figures import Plotted, figure_of, one_output
-from psa_casadi.report.words.phrases import counted, number, percent, plain
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.tables import parameter_table
 from psa_casadi.report.words.text import identification_text, posterior_text, story
 from psa_casadi.simulation.simulate import Trajectory
@@ -59,35 +59,20 @@ def plot(result: Plotted, ax: Axes | None = None, output: str | None = None) -> 
     return figure_of(result) if whole else one_output(result, ax, output)
 
 
+#: The sentences of results in one line.
+_LINES: tuple[tuple[Any, str], ...] = (
+    (StackDiagnosis | DiagnosisFile, "stack_diagnosis"),
+    (Diagnosis | AnyDiagnosisFile, "diagnosis"),
+    (StackIdentification, "identification"),
+    (Posterior, "posterior"),
+    (Trajectory, "trajectory"),
+)
+
+
 def line(result: Plotted | AnyDiagnosisFile) -> str:
     """Return a result in one line."""
-    if isinstance(result, Diagnosis | AnyDiagnosisFile):
-        return _diagnosis(result)
-    if isinstance(result, StackIdentification):
-        records = counted(len(result.experiments), "record")
-        span = max(e.record.range_m for e in result.experiments)
-        rest = number(100.0 * result.fit.rms / span, 2)
-        free = len(result.determinacy.names)
-        return f"<Identification: {free} parameters from {records}; residual {rest} % of range rms>"
-    if isinstance(result, Identification | Signals):
-        return repr(result).partition("\n")[0]
-    if isinstance(result, Posterior):
-        names = ", ".join(f.name for f in result.figures)
-        return f"<Posterior of {names}: {result.chains} chains of {result.draws} draws>"
-    ends = " to ".join(number(float(result.time[k])) for k in (0, -1))
-    outputs = ", ".join(result.outputs)
-    return f"<Trajectory: {len(result.time)} samples from {ends} s; outputs {outputs}>"
-
-
-def _diagnosis(d: Diagnosis | AnyDiagnosisFile) -> str:
-    named = ", ".join(f"{plain(c.effect)} {percent(c.confidence)}" for c in d.causes)
-    causes = f": {named}" if named else ""
-    if not isinstance(d, StackDiagnosis | DiagnosisFile):
-        return f"<Diagnosis of an own model {d.verdict}{causes}>"
-    before, after = (e.holdout_nrmse_percent for e in (d.base_errors, d.extended_errors))
-    first = f"{number(before, 2)} -> " if before != after else ""
-    errors = f"{first}{number(after, 2)} % of range rms"
-    return f"<Diagnosis {d.verdict}{causes}; held-out error {errors}>"
+    code = next((code for kind, code in _LINES if isinstance(result, kind)), None)
+    return say(f"line.{code}", r=result) if code else repr(result).partition("\n")[0]
 
 
 def cell(result: Plotted | Model | AnyDiagnosisFile) -> str:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -14,7 +13,15 @@ from psa_casadi.common.errors import InputError, MachineError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Structure
 from psa_casadi.simulation.compiler import sources_directory
-from psa_casadi.simulation.exact.run import FINEST, MOST_IN_LANES, NotExact, model_text, time_steps
+from psa_casadi.simulation.exact.run import (
+    FINEST,
+    MOST_IN_LANES,
+    NotExact,
+    Numbers,
+    Task,
+    model_text,
+    time_steps,
+)
 
 #: Options of its compiler: functions without a place are the device's; products and sums are
 #: rounded one by one, as on the CPU.
@@ -56,29 +63,6 @@ class Summary(NamedTuple):
     largest: FloatArray
     last: FloatArray
     squares: FloatArray
-
-
-@dataclass(frozen=True)
-class Task:
-    """A model's output under inputs `u` (n, nu) at times `t` (n,) [s], compared with `meant` (n,).
-
-    `tolerance` bounds the error of a step over the states' nominal sizes.
-    """
-
-    structure: Structure
-    output: str
-    t: FloatArray
-    u: FloatArray
-    meant: FloatArray
-    tolerance: float
-
-
-class Numbers(NamedTuple):
-    """Parameters p (np, m), initial states and nominal sizes (nx, m) of m sets."""
-
-    p: FloatArray
-    x0: FloatArray
-    nominal: FloatArray
 
 
 def device_module() -> Any:

@@ -12,8 +12,8 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import nominal_value
 from psa_casadi.records.record import Record
-from psa_casadi.simulation.device import Numbers, Summary, Task, device_module, run_on_device
-from psa_casadi.simulation.exact.run import LANES, NotExact, run_sets
+from psa_casadi.simulation.device import Summary, device_module, run_on_device
+from psa_casadi.simulation.exact.run import LANES, NotExact, Numbers, Task, run_sets
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.simulate import Way, output_of, record_inputs, trace
 from psa_casadi.simulation.start import start_on, starts_on
@@ -175,12 +175,8 @@ def _on_cores(model: Model, task: Task, p: FloatArray, reduce: _Reduce | None) -
         return []
 
     def lanes(which: range) -> list[FloatArray]:
-        p_of, x0, nominal = (a[:, which.start : which.stop] for a in numbers)
-        values = run_sets(
-            task.structure, task.t, task.u, p=p_of, x0=x0, nominal=nominal,
-            tolerance=task.tolerance, output=task.output,
-        )  # fmt: skip
-        return kept(values.T, which)
+        part = Numbers(*(a[:, which.start : which.stop] for a in numbers))
+        return kept(run_sets(task, part).T, which)
 
     def alone(which: range) -> list[FloatArray]:
         one = _alone(model, p[:, which.start])

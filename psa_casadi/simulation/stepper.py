@@ -19,7 +19,7 @@ from psa_casadi.common.interruption import flag_address
 from psa_casadi.common.units import FloatArray
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.simulation.compiler import fingerprint, generate_c, generated_library
-from psa_casadi.simulation.timings import count_run, count_steps
+from psa_casadi.simulation.timings import count_run
 
 #: The files of `fmu_src` that integrate a model.
 SOURCES = ("solver.c", "linear.c", "instants.c", "model_casadi.c", "trajectory.c")
@@ -156,7 +156,6 @@ def run(
     _check(model, arrays, hold)
     if not nx:  # C has one unused state
         arrays |= {"x0": np.zeros(1), "s0": np.zeros((1, count))}
-    count_run(differentiated=count > 0)
     request = _Run(
         samples=n, zero_order_hold=int(hold == "zero"), rtol=rtol, max_step=max_step,
         steps_limit=steps_limit, steps_most=steps_most, count=count, stop=flag_address(),
@@ -164,7 +163,8 @@ def run(
         **{name: array.ctypes.data for name, array in arrays.items()},
     )  # fmt: skip
     status = _library(model.structure).psa_run(ctypes.byref(request))
-    count_steps(_DEARER * (request.steps + request.rejected) * (1 + count))
+    steps = _DEARER * (request.steps + request.rejected) * (1 + count)
+    count_run(steps, differentiated=count > 0)
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status == _NO_MEMORY:

@@ -112,13 +112,6 @@ def stage(name: str) -> Iterator[None]:
             yield
 
 
-def count_run(*, differentiated: bool) -> None:
-    """Count a simulation for the present stage where someone records it."""
-    timings = _timings.get()
-    if timings is not None:
-        timings.count(differentiated=differentiated)
-
-
 class Work:
     """Steps of simulations, times one plus their derivatives: the same everywhere.
 
@@ -143,8 +136,9 @@ def counted() -> AbstractContextManager[Work]:
     return set_within(_work, Work())
 
 
-def count_steps(steps: int) -> None:
-    """Count the steps of a simulation where someone asks for them."""
-    work = _work.get()
-    if work is not None:
+def count_run(steps: int, *, differentiated: bool) -> None:
+    """Count a simulation for the present stage, and its steps, where someone records them."""
+    if timings := _timings.get():
+        timings.count(differentiated=differentiated)
+    if work := _work.get():
         work.add(steps)

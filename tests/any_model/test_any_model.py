@@ -17,8 +17,7 @@ import psa_casadi as psa
 from build_scripts import effects_page
 from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.generic.attached import extended
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.examples import motor_pack, several_motors
 from psa_casadi.identification.experiments import experiments_of

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import binom
 
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.held_out import Share, removed_from
+from psa_casadi.diagnosis.held_out import Removed, Share
 from psa_casadi.records.signals import Signals
 from psa_casadi.records.split import Channel, Experiment
 
@@ -56,7 +56,7 @@ def _shares(rng: np.random.Generator, records: int) -> _Drawn:
     runs, one, other = _drawn(rng, records)
     none = [np.zeros((SAMPLES, 2)) for _ in runs]
     both = [a + b for a, b in zip(one, other, strict=True)]
-    removed = removed_from(runs, both, NOISE.tolist())
+    removed = Removed(runs, both, NOISE.tolist())
     return _Drawn(
         removed.share("first", one, none),
         removed.share("other", other, none),
@@ -94,7 +94,7 @@ def test_a_share_is_displayed_from_0_to_1_and_without_noise_it_is_that_of_the_po
     runs, one, _ = _drawn(np.random.default_rng(2), 1)
     (run,) = runs
     quiet = [replace(run, record=_signals(np.zeros((SAMPLES, 2))))]
-    left = removed_from(quiet, one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
+    left = Removed(quiet, one, (0.0, 0.0)).share("half", one, [0.5 * one[0]])
     assert left.share == pytest.approx(0.75, rel=1e-9)
-    still = removed_from(quiet, [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)
+    still = Removed(quiet, [0.0 * one[0]], (0.0, 0.0)).share("none", one, one)
     assert (still.share, still.interval) == (0.0, (0.0, 0.0))

@@ -396,10 +396,12 @@ def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
     record = plants.motor(2, friction=0.0)
     with pytest.raises(psa.InputError, match=r"`holdout` are those of 'drive', which is fitted"):
         psa.diagnose(motor(), record, holdout=record)
-    with pytest.raises(psa.InputError, match=r"'known_stat' is not among the words for a model of"):
+    with pytest.raises(psa.InputError, match=r"'known_stat' is not among the arguments for your"):
         psa.identify(motor(), record, known_stat=True)  # type: ignore[call-overload]
-    with pytest.raises(psa.InputError, match=r"'known_start' is not among the words for a stack"):
+    with pytest.raises(psa.InputError, match=r"'known_start' is not among the arguments for a st"):
         psa.identify("record.csv", known_start=True)  # type: ignore[call-overload]
+    with pytest.raises(psa.InputError, match=r"`leave_out` has 'slow_crep', which is no effect"):
+        psa.diagnose("record.csv", leave_out=["slow_crep"])
     with pytest.raises(psa.InputError, match=r"no effect; of the \d+ there are.* are lag"):
         psa.diagnose(motor(), record, leave_out=["lagg"], starts=1)
 

@@ -4,7 +4,6 @@ import os
 import re
 import shlex
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-import psa_casadi
 import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
 from psa_casadi.cli import screen
@@ -23,20 +21,14 @@ from psa_casadi.cli.app import app
 from psa_casadi.cli.check import check_cases
 from psa_casadi.cli.failures import junit_text
 from psa_casadi.cli.screen import DIAGNOSE, IDENTIFY, Course, ProgressLine, show_table, working
-from psa_casadi.datasets import DATASETS
 from psa_casadi.examples.index import examples
-from psa_casadi.export.check.check import CheckReport, CheckRow
-from psa_casadi.export.importer.fmu_model import load_model
+from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.identification import identify
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.model_file import save_model
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import read_record
 from psa_casadi.records.split import whole
 from psa_casadi.report.page import playground
 from psa_casadi.report.words.tables import Table, effects_table
-from tests.contract.helpers import command, done
+from tests.contract.helpers import PSA, command, done
 from tests.identification.identified_plants import same_as_the_named_stack
 from tests.records.record_files import HEADER, ROWS, write
 from tests.report.report_cases import identification
@@ -44,13 +36,13 @@ from tests.tiers import slow
 
 
 def test_the_version_is_one() -> None:
-    assert done("--version").out == f"psa_casadi {psa_casadi.__version__}\n"
+    assert done("--version").out == f"psa_casadi {psa.__version__}\n"
     root = Path(__file__).parents[2]
     citation = (root / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\nversion: {psa_casadi.__version__}\n" in citation
+    assert f"\nversion: {psa.__version__}\n" in citation
     released = re.search(r"^date-released: (\S+)$", citation, re.MULTILINE)
     assert released is not None
-    heading = f"\n## [{psa_casadi.__version__}] - {released[1]}\n"
+    heading = f"\n## [{psa.__version__}] - {released[1]}\n"
     assert heading in (root / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
@@ -62,8 +54,8 @@ def test_the_page_goes_on_from_the_demo_whose_stack_is_what_its_record_gives(
     block = block_in_tests("docs/howto/fmu_export.md")
     assert shlex.split(block.commands[0]) == ["psa", "demo"]
     assert run_block(block, tmp_path) is None
-    record = read_record(tmp_path / "psa_demo" / "synthetic_record.csv")
-    model = load_model(tmp_path / "psa_demo" / "model.json")
+    record = psa.read_record(tmp_path / "psa_demo" / "synthetic_record.csv")
+    model = psa.load_model(tmp_path / "psa_demo" / "model.json")
     rms = fit(model, [whole(record)], [], sigma=[1e-3 * record.range_m]).rms
     same_as_the_named_stack(rms, record, "demo")
 
@@ -73,19 +65,18 @@ def test_the_playground_and_a_posterior_take_a_model(
     way: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, played = tmp_path / "model.json", []
-    save_model(stack_model("demo"), file)
+    psa.save_model(psa.stack_model("demo"), file)
     monkeypatch.setattr(playground, "write_playground", lambda *inputs: played.append(inputs))
     assert command("web", *way, file, "-o", tmp_path / "p.html").code == 0
     ((path, model),) = played
     assert path == tmp_path / "p.html"
-    assert model.values == stack_model("demo").values
+    assert model.values == psa.stack_model("demo").values
     twice = command("web", *way, file, file)
     assert twice.code == 2
     assert "is one file too many" in twice.words
     words: list[str | Path] = [*way, file, tmp_path / "absent.csv"]
-    assert command("sample", *words).err.startswith(
-        f"Error: {tmp_path / 'absent.csv'}: there is no"
-    )
+    text = command("sample", *words).err
+    assert text.startswith(f"Error: {tmp_path / 'absent.csv'}: there is no")
     without = command("sample", tmp_path / "absent.csv")
     assert "No model is given; add --model MODEL.json" in without.err
 
@@ -133,12 +124,12 @@ def test_a_table_on_a_terminal_is_neither_cut_nor_too_wide(
 ) -> None:
     monkeypatch.setattr("sys.stdout.isatty", lambda: terminal)
     monkeypatch.setenv("COLUMNS", "80")
-    show_table(effects_table(EFFECTS.values()))
+    show_table(effects_table(psa.EFFECTS.values()))
     lines = re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()
     assert max(len(line.rstrip()) for line in lines) <= 80
     words = {word for line in lines for word in line.split()}
-    assert set(EFFECTS) <= words
-    assert {w for e in EFFECTS.values() for w in e.looks_like.split()} <= words
+    assert set(psa.EFFECTS) <= words
+    assert {w for e in psa.EFFECTS.values() for w in e.looks_like.split()} <= words
 
 
 def cases_of(text: str) -> dict[str, str | None]:
@@ -153,7 +144,7 @@ def test_the_checks_of_an_fmu_are_tests() -> None:
         CheckRow("agreement", 3e-3, 1e-4, False, 'at "0.1 s" & <\x1b>'),
         CheckRow("states", float("nan"), 0.0, False, "the check stopped"),
     )
-    report = CheckReport(Path("a.fmu"), rows, compared=True)
+    report = psa.CheckReport(Path("a.fmu"), rows, compared=True)
     text = junit_text("check", "a.fmu", check_cases(report), 1.0)
     whole = fromstring(text)
     counts = {"name": "psa check a.fmu", "tests": "3", "failures": "2", "errors": "0"}
@@ -186,7 +177,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return result
 
 
-def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
+def test_a_line_states_step_time_and_what_is_usual(clock: Clock) -> None:
     output = ProgressLine("diagnosing", DIAGNOSE)
     assert output.line() == "diagnosing, 0 s (most take up to 40 s)"
     clock.now = 7.4
@@ -203,7 +194,7 @@ def test_a_line_tells_step_time_and_what_is_usual(clock: Clock) -> None:
     assert displayed.get().strip() == output.line()
 
 
-def test_lines_that_stay_tell_once_what_is_usual(
+def test_lines_that_stay_state_once_what_is_usual(
     clock: Clock, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with working("diagnosing", DIAGNOSE) as progress:
@@ -224,7 +215,7 @@ def test_lines_that_stay_tell_once_what_is_usual(
         (DIAGNOSE, ["identification/search.py", "diagnosis/**/*.py"]),
     ],
 )
-def test_what_is_told_belongs_to_a_step(course: Course, rooms: list[str]) -> None:
+def test_every_message_of_progress_belongs_to_a_step(course: Course, rooms: list[str]) -> None:
     texts = [p.read_text("utf-8") for r in rooms for p in SOURCE.glob(r)]
     result = {m for t in texts for m in re.findall(r'progress\(f?"([^"{]{3,})', t)}
     assert len(result) > 5
@@ -274,21 +265,15 @@ def test_the_help_shows_its_texts_whole_in_80_columns(path: tuple[str, ...]) -> 
         ("psa diagnose a.csv --leave-out ", psa.EFFECTS),
         ("psa design experiment --separate sensor_r", ["sensor_ripple"]),
         ("psa export fmu --part ", psa.PARTS),
-        (
-            "psa datasets steering_mirror_",
-            [n for n in DATASETS if n.startswith("steering_mirror_")],
-        ),
+        ("psa datasets steering_mirror_", ["steering_mirror_test"]),
         ("psa examples use_in_", [n for n in examples() if n.startswith("use_in_")]),
         ("psa diagnose a.csv --expect adequate,cau", ["adequate,cause_named"]),
     ],
 )
 def test_a_shell_completes_the_names_that_there_are(line: str, names: Any) -> None:
     table = {"_PSA_COMPLETE": "complete_bash", "COMP_WORDS": line}
+    table["COMP_CWORD"] = str(line.count(" "))
     displayed = subprocess.run(
-        [sys.executable, "-m", "psa_casadi.cli"],
-        env=os.environ | table | {"COMP_CWORD": str(len(line.split(" ")) - 1)},
-        capture_output=True,
-        text=True,
-        check=True,
+        PSA, env=os.environ | table, capture_output=True, text=True, check=True
     )
     assert set(displayed.stdout.split()) == set(names)

@@ -10,19 +10,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.failures import guarded
 from psa_casadi.common import cache
-from psa_casadi.common.errors import InputError, MachineError
 from psa_casadi.common.files import PREFIX, atomic_path, atomic_write
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.model_file import dumps
 from psa_casadi.simulation import compiler
 from tests.contract.helpers import refused
 from tests.records.record_files import write
+from tests.tiers import posix, slow_but
 
-posix = pytest.mark.skipif(sys.platform == "win32", reason="shells, signals and devices of POSIX")
-MODEL = dumps(compose(BASE))
 FAULT = "This is a fault of psa_casadi"
 #: A locale that knows ASCII alone, which Python does not replace by UTF-8.
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
@@ -50,14 +46,10 @@ STREAMS = {
     "output on a full disk": ("psa effects >/dev/full", 1, "Failed: the disk is full"),
     "help on a full disk": ("psa --help >/dev/full", 1, "Failed: the disk is full"),
 }
-SLOW_STREAMS = ("output closed", "output on a full disk")
 
 
 @posix
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(c, marks=[pytest.mark.slow] if c in SLOW_STREAMS else []) for c in STREAMS],
-)
+@pytest.mark.parametrize("case", slow_but([c for c in STREAMS if "output" not in c], STREAMS))
 def test_output_that_cannot_be_written(case: str) -> None:
     line, code, statement = STREAMS[case]
     done = shell(line)
@@ -119,7 +111,10 @@ REFUSED: dict[str, tuple[BaseException, str]] = {
         ModuleNotFoundError("No module named 'casadi'", name="casadi"),
         "the installation is not complete (No module named 'casadi'); install",
     ),
-    "compiler": (MachineError("The C compiler x cannot be started."), "The C compiler x cannot"),
+    "compiler": (
+        psa.MachineError("The C compiler x cannot be started."),
+        "The C compiler x cannot",
+    ),
 }
 
 
@@ -149,8 +144,8 @@ def test_a_fault_of_the_package_is_called_one(
     assert ended_by(error) == (1, "")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="a folder that is used cannot be removed")
-def test_a_working_folder_that_was_removed_is_said(
+@posix
+def test_a_working_folder_that_was_removed_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone = tmp_path / "gone"
@@ -184,7 +179,7 @@ def test_a_compiler_that_does_not_work(
     command: str, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", command)
-    with pytest.raises(MachineError, match=COMPILERS[command]):
+    with pytest.raises(psa.MachineError, match=COMPILERS[command]):
         compiler.shared_library({"a.c": "int a;"}, ())
     assert not list(empty_cache.rglob("*.so"))
 
@@ -217,15 +212,14 @@ def test_files_that_cannot_be_written_are_named(tmp_path: Path) -> None:
     atomic_write(fits, "text")
     assert fits.read_text() == "text"
     atomic_write(tmp_path / ("µ" * 120 + ".json"), "text")
-    with pytest.raises(InputError, match="File name too long"):
+    with pytest.raises(psa.InputError, match="File name too long"):
         atomic_write(too_long, "text")
-    model = write(tmp_path / "model.json", MODEL)
-    assert "File name too long" in refused("export", "fmu", "--model", model, "-o", too_long)
+    assert "File name too long" in refused("export", "fmu", "--stack", "demo", "-o", too_long)
 
 
 @posix
 def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"No space left on device.*choose another place"):
+    with pytest.raises(psa.InputError, match=r"No space left on device.*choose another place"):
         atomic_write("/dev/full", "text")
 
     def fill() -> None:
@@ -234,7 +228,7 @@ def test_a_disk_that_fills_up_while_a_file_is_written(tmp_path: Path) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     (tmp_path / "x.fmu").write_text("old")
-    with pytest.raises(InputError, match=r"x\.fmu: cannot write \(No space left"):
+    with pytest.raises(psa.InputError, match=r"x\.fmu: cannot write \(No space left"):
         fill()
     assert (tmp_path / "x.fmu").read_text() == "old"
     assert os.listdir(tmp_path) == ["x.fmu"]

@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -17,18 +16,16 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.common.interruption import interruptible_work
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.export.importer import masters
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.identification.identify import identify
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import input_samples
-from tests.contract.helpers import command
+from tests.contract.helpers import PSA, command
 from tests.report.report_cases import diagnosis
 from tests.studies.plants.make import make_record
-from tests.tiers import slow
+from tests.tiers import posix, slow
 
 TIME: FloatArray = np.arange(600, dtype=float) * 5e-3
 VOLTAGE = 50.0 - 50.0 * np.cos(4 * np.pi * TIME)
@@ -105,7 +102,7 @@ def test_a_diagnosis_keeps_the_best_model_so_far(
     word: str, effects: int, record: psa.Record
 ) -> None:
     with pytest.raises(DiagnosisInterrupted) as stop:
-        diagnose([record], effects=TABLE, progress=at(word))
+        psa.diagnose([record], effects=TABLE, progress=at(word))
     model = stop.value.model
     assert model.provenance.interrupted
     assert len(model.effects) == effects
@@ -116,17 +113,17 @@ def test_a_diagnosis_keeps_the_best_model_so_far(
 
 def test_the_base_fit_is_not_swallowed(record: psa.Record) -> None:
     with pytest.raises(KeyboardInterrupt) as stop:
-        diagnose([record], effects=TABLE, progress=at("base fit from"))
+        psa.diagnose([record], effects=TABLE, progress=at("base fit from"))
     assert not isinstance(stop.value, DiagnosisInterrupted)  # nothing was fitted yet
     with pytest.raises(DiagnosisInterrupted, match="base model; its values are not final"):
-        diagnose([record], effects=TABLE, progress=at("to the end"))
+        psa.diagnose([record], effects=TABLE, progress=at("to the end"))
 
 
 @pytest.mark.parametrize(
     ("word", "search"), [("to the end", True), ("what further records", False)]
 )
 def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Record) -> None:
-    result = identify([record], progress=at(word))
+    result = psa.identify([record], progress=at(word))
     assert result.interrupted
     assert result.fit.interrupted == result.model.provenance.interrupted == search
     assert not result.advice
@@ -143,7 +140,7 @@ def test_an_identification_keeps_its_fit(word: str, search: bool, record: psa.Re
         ("identify", "starting", "there was no result yet, so nothing was kept."),
     ],
 )
-def test_a_command_says_what_it_kept(
+def test_a_command_names_what_it_kept(
     name: str, word: str, message: str, record: psa.Record, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -169,7 +166,7 @@ def test_a_command_says_what_it_kept(
         assert psa.load_model(m).provenance.interrupted == cut
 
 
-def test_a_solver_does_not_take_an_interrupt_for_its_own_failure() -> None:
+def test_a_solver_does_not_take_an_interrupt_for_a_failure() -> None:
     """IPOPT ends at an interrupt as at a failure, which other starts would make up for."""
     with interruptible_work() as work:
         work.stop()
@@ -185,33 +182,31 @@ def test_a_designed_voltage_is_kept_without_its_check(
     path = {"time [s]": time, "displacement [um]": 5.0 - 5.0 * np.cos(150.0 * time)}
     psa.write_record(tmp_path / "path.csv", path)
     voltage = tmp_path / "v.csv"
-    items = ["design", "input", "--fast", "--stack", "P-885.51", "-o", str(voltage)]
-    ended = command(*items, "--target", tmp_path / "path.csv")
+    work = ("design", "input", "--fast", "--stack", "P-885.51", "--target", tmp_path / "path.csv")
+    ended = command(*work, "-o", voltage)
     assert ended.code == 130
     assert f"the voltage was designed before. Kept: {voltage}." in ended.err
     assert voltage.exists()
 
 
-def test_files_that_stand_are_named_however_late_the_interrupt(
+def test_written_files_are_named_however_late_the_interrupt(
     record: psa.Record, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(import_module("psa_casadi.cli.simulate"), "show_written", cut)
     psa.write_record(tmp_path / "r.csv", record)
     out = tmp_path / "out.csv"
-    items = ["simulate", "--stack", "P-885.51", "--input", str(tmp_path / "r.csv"), "-o", str(out)]
-    ended = command(*items)
+    ended = command("simulate", "--stack", "P-885.51", "--input", tmp_path / "r.csv", "-o", out)
     assert ended.code == 130
     assert f"Interrupted: written before: {out}." in ended.err
 
 
 @slow
-@pytest.mark.skipif(sys.platform == "win32", reason="SIGINT cannot be sent to one process")
+@posix
 def test_a_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     record, model, page = (tmp_path / n for n in ("r.csv", "m.json", "r.html"))
     make_record("slow_creep", 3, record)
-    inputs: list[str | Path] = [sys.executable, "-m", "psa_casadi.cli", "diagnose", record]
     process = subprocess.Popen(
-        [*inputs, "-o", model, "--report", page, "--still"],
+        [*PSA, "diagnose", record, "-o", model, "--report", page, "--still"],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip

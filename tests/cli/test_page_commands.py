@@ -6,22 +6,17 @@ from typing import Any
 import pytest
 from typer.main import get_command
 
+import psa_casadi as psa
 from build_scripts import copied_pages
 from build_scripts.measured_data import ROOT
 from build_scripts.page_commands import blocks_of, find_blocks, pages, run_blocks
 from psa_casadi.cli.app import app
-from psa_casadi.model.effects import EFFECTS
 
 TEXT = Path(__file__).with_name("commands.md").read_text("utf-8")
 
 
 #: The pages whose one block a test runs.
-IN_TESTS = [
-    "README.md",
-    "docs/howto/fmu_export.md",
-    "docs/howto/own_model.md",
-    "docs/python.md",
-]
+IN_TESTS = ["README.md", "docs/howto/fmu_export.md", "docs/howto/own_model.md", "docs/python.md"]
 
 
 def run_text(text: str) -> list[str]:
@@ -84,11 +79,7 @@ def test_a_block_that_a_test_runs_is_left_to_it() -> None:
     assert run_text(TEXT.replace("run: skip, it ends", "run: in-tests")) == []
     marked = [b.page for p in pages() for b in blocks_of(p) if "in-tests" in b.marks]
     assert list(dict.fromkeys(marked)) == IN_TESTS
-    files = (
-        "any_model/test_any_model",
-        "cli/test_cli",
-        "diagnosis/test_measured_rows",
-    )
+    files = ("any_model/test_any_model", "cli/test_cli", "diagnosis/test_measured_rows")
     used = "".join((ROOT / "tests" / f"{n}.py").read_text("utf-8") for n in files)
     assert all(f'_in_tests("{page}")' in used for page in IN_TESTS)
 
@@ -130,7 +121,7 @@ def test_a_mark_that_does_not_exist_and_a_block_without_end_are_refused() -> Non
 def test_the_table_of_effects_is_that_of_the_package(place: str) -> None:
     lines = (ROOT / "docs" / "howto" / "diagnose.md").read_text(encoding="utf-8").splitlines()
     row = next(line for line in lines if line.startswith(f"| {place} | `"))
-    items = [e.name for e in EFFECTS.values() if e.belongs_to == place]
+    items = [e.name for e in psa.EFFECTS.values() if e.belongs_to == place]
     assert re.findall(r"`(\w+)`", row) == items
 
 

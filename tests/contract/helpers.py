@@ -1,8 +1,11 @@
-"""The command in this process, and records of an independent stack, as all contract tests use."""
+"""The command in this process, its page, and records of an independent stack."""
 
+import http.client
 import io
 import os
+import re
 import signal
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -11,6 +14,7 @@ from contextvars import copy_context
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -22,6 +26,8 @@ from psa_casadi.common.units import FloatArray
 
 Floats = FloatArray
 DATA = Path(psa.__file__).parent / "data"
+#: The command as a process.
+PSA = [sys.executable, "-m", "psa_casadi.cli"]
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 
 
@@ -42,7 +48,7 @@ class Ended:
 def command(*words: str | Path) -> Ended:
     """Run `psa` in this process."""
     out, err, code = io.StringIO(), io.StringIO(), 0
-    with _own_process(["psa", *map(str, words)]), redirect_stdout(out), redirect_stderr(err):
+    with _restored_process(["psa", *map(str, words)]), redirect_stdout(out), redirect_stderr(err):
         try:
             copy_context().run(main)  # which keeps what was typed
         except SystemExit as ended:
@@ -51,7 +57,7 @@ def command(*words: str | Path) -> Ended:
 
 
 @contextmanager
-def _own_process(argv: list[str]) -> Iterator[None]:
+def _restored_process(argv: list[str]) -> Iterator[None]:
     """Put back what a command changes of its process."""
     before, folder, kept = sys.argv, tempfile.tempdir, os.environ.get("TMPDIR")
     handlers = {number: signal.getsignal(number) for number in SIGNALS}
@@ -101,6 +107,21 @@ def table(path: Path) -> dict[str, Floats]:
     }
 
 
+def rms(values: Floats) -> float:
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def off(result: Floats, expected: Floats) -> float:
+    """Return the largest difference over the range."""
+    return float(np.max(np.abs(result - expected)) / np.ptp(expected))
+
+
+def samples(**columns: Any) -> Any:
+    """Return columns (n,) as the structured array that fmpy takes as input; the first is time."""
+    rows = list(zip(*columns.values(), strict=True))
+    return np.array(rows, [(name, float) for name in columns])
+
+
 def write(path: Path, columns: dict[str, Floats]) -> Path:
     """Write a CSV file by plain means."""
     lines = [",".join(columns)]
@@ -124,3 +145,39 @@ def reference_run(
 def on_reference(values: Mapping[str, float], t: Floats, v: Floats) -> reference.Trajectory:
     """Return the run of the independent model under a voltage that is linear between samples."""
     return reference.simulate(values, reference.from_samples(t, v), t, breakpoints=list(t))
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[tuple[str, str]]:
+    """Serve the page that diagnoses; yield host and port, and the token in its address.
+
+    It works in a folder, of which nothing is left when it is interrupted.
+    """
+    running = subprocess.Popen(
+        [*PSA, "web", "--diagnose", "--no-browser"], cwd=folder, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1", "TMPDIR": str(folder)},
+    )  # fmt: skip
+    assert running.stdout is not None
+    try:
+        pattern = re.compile(r"http://(127\.0\.0\.1:\d+)/\?token=(\S+)")
+        address = next(filter(None, map(pattern.search, running.stdout)), None)
+        assert address, "no address was printed"
+        yield address[1], address[2]
+    finally:
+        running.send_signal(signal.SIGINT)
+        output, _ = running.communicate(timeout=30)
+    assert (running.returncode, "Ended" in output) == (0, True), output
+    assert list(folder.iterdir()) == []
+
+
+def request(
+    place: str, method: str, path: str, body: bytes | None = None, **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    line = http.client.HTTPConnection(place, timeout=30)
+    try:
+        line.request(method, path, body, {n.replace("_", "-"): v for n, v in headers.items()})
+        answer = line.getresponse()
+        return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    finally:
+        line.close()

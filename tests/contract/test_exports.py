@@ -2,7 +2,6 @@
 
 import ctypes
 import json
-import re
 import shutil
 import subprocess
 import zipfile
@@ -23,8 +22,8 @@ from fmpy.validation import validate_fmu
 
 import psa_casadi as psa
 from psa_casadi import reference
-from tests.contract.helpers import Floats, command, done, reference_run, refused
-from tests.contract.test_models import off, van_der_pol
+from tests.contract.helpers import Floats, done, off, reference_run, refused, samples
+from tests.contract.test_models import van_der_pol
 from tests.tiers import slow
 
 STACK = "P-885.51"
@@ -38,23 +37,16 @@ def fmu_of(fmi: int) -> Path:
     return path
 
 
-def played(
-    path: Path, time: Floats, inputs: Mapping[str, Floats], kind: str = "CoSimulation", **more: Any
-) -> Any:
+def played(path: Path, time: Floats, inputs: Mapping[str, Floats], **more: Any) -> Any:
     """Return what fmpy makes of an FMU whose inputs are lines between samples."""
-    arguments = np.zeros(time.size, dtype=[("time", float), *((n, float) for n in inputs)])
-    arguments["time"] = time
-    for name, values in inputs.items():
-        arguments[name] = values
     return fmpy.simulate_fmu(
-        str(path),
-        fmi_type=kind,
-        input=arguments,
-        stop_time=float(time[-1]),
-        relative_tolerance=1e-8,
-        output_interval=float(time[1]),
-        **more,
-    )
+        str(path), fmi_type="CoSimulation", input=samples(time=time, **inputs),
+        stop_time=float(time[-1]), relative_tolerance=1e-8, output_interval=float(time[1]), **more,
+    )  # fmt: skip
+
+
+def displacement(time: Floats, result: Any) -> Floats:
+    return np.asarray(np.interp(time, result["time"], result["displacement"]))
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
@@ -62,11 +54,8 @@ def test_an_fmu_is_valid_and_describes_its_ports(fmi: int) -> None:
     assert validate_fmu(str(fmu_of(fmi))) == []
     description = fmpy.read_model_description(str(fmu_of(fmi)))
     assert description.fmiVersion == ("2.0" if fmi == 2 else "3.0")
-    assert (
-        description.coSimulation.modelIdentifier
-        == description.modelExchange.modelIdentifier
-        == "P_885_51"
-    )
+    for interface in (description.coSimulation, description.modelExchange):
+        assert interface.modelIdentifier == "P_885_51"
     variables = {v.name: v for v in description.modelVariables}
     inputs = [v.name for v in description.modelVariables if v.causality == "input"]
     outputs = {v.name: v.unit for v in description.modelVariables if v.causality == "output"}
@@ -116,51 +105,21 @@ def test_an_fmu_whose_inputs_are_held_comes_to_the_reference(fmi: int) -> None:
     for parts in (4, 16):
         fine = np.linspace(0.0, time[-1], parts * (time.size - 1) + 1)
         result = played(fmu_of(fmi), fine, {"voltage": np.interp(fine, time, voltage)})
-        x = np.interp(time, result["time"], result["displacement"])
-        errors.append(off(x, expected.displacement))
+        errors.append(off(displacement(time, result), expected.displacement))
     assert errors[1] == pytest.approx(errors[0] / 4.0, rel=0.1)
     assert errors[1] < 1e-3
-
-
-def test_model_exchange_agrees_with_the_independent_reference() -> None:
-    time, voltage, expected = reference_run()
-    result = played(fmu_of(2), time, {"voltage": voltage}, "ModelExchange")
-    assert (
-        off(np.interp(time, result["time"], result["displacement"]), expected.displacement) < 1e-3
-    )
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_parameters_and_loads_of_an_fmu_act_as_in_the_model(fmi: int) -> None:
     time = np.linspace(0.0, 5e-3, 501)
-    held = np.full(501, -32.0)
-    result = played(
-        fmu_of(fmi), time, {"voltage": 0.0 * time + 60.0, "load_force": held},
-        start_values={"k_L": 6.0, "m_B": 0.2},
-    )  # fmt: skip
-    model = psa.stack_model(STACK).with_values({"k_L": 6.0, "m_B": 0.2}).plant()
-    expected = psa.run(
-        model, time, np.column_stack([0.0 * time + 60.0, held]), np.zeros(len(model.state_names)),
-        rtol=1e-8,
-    )  # fmt: skip
-    x = np.interp(time, result["time"], result["displacement"])
-    assert off(x, expected.y[:, model.output_names.index("displacement")]) < 1e-5
-
-
-def test_an_fmu_starts_settled_where_it_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "x.fmu"
-    done(
-        "export", "fmu", "--stack", STACK, "--start-voltage", "60", "--history", "120,0", "-o", path
-    )
-    time = np.linspace(0.0, 0.02, 201)
-    result = played(path, time, {"voltage": np.full(201, 60.0)})["displacement"]
-    settled = psa.settled_at(psa.stack_model(STACK), 60.0, (120.0, 0.0))
-    there = psa.simulate(settled, time, np.full(201, 60.0), as_exported=True).displacement
-    assert result[0] == pytest.approx(there[0], rel=1e-9)
-    assert np.ptp(result) < 1e-9
-    relaxed = psa.settled_at(psa.stack_model(STACK), 60.0)
-    other = psa.simulate(relaxed, time, np.full(201, 60.0), as_exported=True).displacement
-    assert abs(result[0] - other[0]) > 1e-7
+    inputs = {"voltage": np.full(501, 60.0), "load_force": np.full(501, -32.0)}
+    values = {"k_L": 6.0, "m_B": 0.2}
+    result = played(fmu_of(fmi), time, inputs, start_values=values)
+    model = psa.stack_model(STACK).with_values(values).plant()
+    u, x0 = np.column_stack([*inputs.values()]), np.zeros(len(model.state_names))
+    y = psa.run(model, time, u, x0, rtol=1e-8).y[:, model.output_names.index("displacement")]
+    assert off(displacement(time, result), y) < 1e-5
 
 
 def test_options_name_an_fmu_and_keep_the_sensor(tmp_path: Path) -> None:
@@ -194,44 +153,12 @@ def test_the_same_model_gives_the_same_bytes_and_carries_itself(tmp_path: Path) 
 
 @slow
 @pytest.mark.parametrize("fmi", [2, 3])
-def test_a_check_passes_what_is_right_and_names_what_is_not(fmi: int, tmp_path: Path) -> None:
+def test_a_check_passes_and_writes_its_rows(fmi: int, tmp_path: Path) -> None:
     passed = done("check", fmu_of(fmi), "--stack", STACK, "--json", tmp_path / "c.json",
                   "--junit", tmp_path / "c.xml")  # fmt: skip
     assert "FAIL" not in passed.out
-    content = json.loads((tmp_path / "c.json").read_text("utf-8"))
-    assert content["format"] == "psa_casadi.check/1"
-    xml = (tmp_path / "c.xml").read_text("utf-8")
-    assert re.search(r'failures="0"', xml)
-
-
-@slow
-def test_a_check_beside_another_model_fails() -> None:
-    other = command("check", fmu_of(2), "--stack", "PTBS200")
-    assert other.code == 1
-    assert "FAIL" in other.out
-    report = psa.check_fmu(fmu_of(2), psa.stack_model(STACK))
-    assert report.passed
-    assert report.compared
-    assert len(report.rows) > 10
-
-
-@slow
-def test_a_check_finds_a_description_that_was_spoiled(tmp_path: Path) -> None:
-    with zipfile.ZipFile(fmu_of(2)) as archive:
-        entries = {n: archive.read(n) for n in archive.namelist()}
-    description = entries["modelDescription.xml"].decode()
-    spoiled = {
-        "start value": description.replace('start="7.3"', 'start="7.4"', 1),
-        "guid": re.sub(r'guid="\{?.', 'guid="{0', description, count=1),
-        "xml": description.replace("</fmiModelDescription>", ""),
-    }
-    for name, text in spoiled.items():
-        assert text != description, name
-        path = tmp_path / "spoiled.fmu"
-        with zipfile.ZipFile(path, "w") as archive:
-            for entry, data in entries.items():
-                archive.writestr(entry, text if entry == "modelDescription.xml" else data)
-        assert command("check", path).code in (1, 2), name
+    assert '"psa_casadi.check/1"' in (tmp_path / "c.json").read_text("utf-8")
+    assert 'failures="0"' in (tmp_path / "c.xml").read_text("utf-8")
 
 
 def test_a_step_of_fixed_length_is_exported_for_co_simulation(tmp_path: Path) -> None:
@@ -242,14 +169,12 @@ def test_a_step_of_fixed_length_is_exported_for_co_simulation(tmp_path: Path) ->
     assert float(description.defaultExperiment.stepSize) == 1e-4
     time, voltage, expected = reference_run()
     result = played(path, time, {"voltage": voltage}, step_size=2e-4)
-    x = np.interp(time, result["time"], result["displacement"])
-    assert off(x, expected.displacement) < 0.02
-    text = refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
-    assert "--step" in text
+    assert off(displacement(time, result), expected.displacement) < 0.02
+    assert "--step" in refused("export", "fmu", "--stack", STACK, "--solver", "fixed", "-o", path)
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
-def test_c_for_a_controller_errs_as_little_as_it_says(precision: str, tmp_path: Path) -> None:
+def test_c_for_a_controller_errs_as_little_as_stated(precision: str, tmp_path: Path) -> None:
     compiler = shutil.which("cc") or pytest.skip("no C compiler")
     text = done("export", "c", "--stack", STACK, "--step", "200us", "--name", "stack",
                 "--precision", precision, "-o", tmp_path / "code").out  # fmt: skip
@@ -287,10 +212,6 @@ def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None
     model = psa.stack_model(STACK)
     path = psa.export_modelica(model, tmp_path / "PiezoStack.mo")
     text = path.read_text("utf-8")
-    assert text.startswith("package PiezoStack") or "\npackage PiezoStack" in text
-    for part in ("model Signal", "Acausal", "Examples"):
-        assert part in text
-    assert re.search(r'Real k_L\(unit="N/V".*\) = 7\.3 "', text)
     stop = 0.02
     harness = (
         f"{text}\nmodel Harness PiezoStack.Signal psa(voltage=2500.0*time, load_force=0.0);"
@@ -326,7 +247,7 @@ def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> No
     assert off(position, expected) < 0.005
 
 
-def test_an_fmu_of_an_own_model_is_read_back_and_runs_alike(tmp_path: Path) -> None:
+def test_an_fmu_of_a_users_model_is_read_back_and_runs_equally(tmp_path: Path) -> None:
     path = psa.export_fmu(van_der_pol(), tmp_path / "v.fmu", fmi=3)
     read = psa.fmu_model(path, free={"mu": (0.1, 10.0)}, values={"mu": 2.3})
     time = np.linspace(0.0, 10.0, 501)

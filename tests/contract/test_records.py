@@ -114,7 +114,7 @@ def test_of_several_tables_in_a_file_one_is_chosen(tmp_path: Path) -> None:
     assert len(psa.read_records([path], columns="table=all")) == 2
 
 
-def test_every_mistake_of_all_files_is_told_at_once(tmp_path: Path) -> None:
+def test_every_mistake_of_all_files_is_reported_at_once(tmp_path: Path) -> None:
     bad = lines(tmp_path / "bad.csv", HEADER, "0,a,1", "1,2,b", *ROWS[2:])
     message = refused(
         "diagnose", bad, tmp_path / "absent.csv", "--model", tmp_path / "no.json",
@@ -154,7 +154,7 @@ def test_tables_and_arrays_are_records(tmp_path: Path) -> None:
         made.voltage[0] = 1.0
 
 
-def test_the_packaged_record_is_as_its_file_says() -> None:
+def test_the_packaged_record_is_that_of_its_file() -> None:
     record, columns = psa.read_record(DATA / "demo.csv"), table(DATA / "demo.csv")
     assert record.n == 5248
     np.testing.assert_allclose(record.voltage, columns["voltage [V]"], rtol=1e-15)

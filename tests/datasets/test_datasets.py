@@ -18,9 +18,8 @@ from psa_casadi import datasets
 from psa_casadi.cli.app import app
 from psa_casadi.common.errors import InputError, PsaError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.datasets import DATASETS, Dataset
+from psa_casadi.datasets import DATA_VARIABLE, DATASETS, Dataset
 from psa_casadi.datasets.devices import Columns, OneAxis, linear_response
-from psa_casadi.datasets.fetching import DATA_VARIABLE
 
 TABLE = "".join(f"{k:.6f}\t9.000000\t{k * 1.8:.6f}\t{-0.5 * k:.6f}\r\n" for k in range(40)).encode()
 #: Makes a dataset of a table at an address.

@@ -112,6 +112,32 @@ def test_an_observer_follows_what_is_not_measured(tmp_path: Path) -> None:
         psa.observer(point, input_noise={}, output_noise={}, step=step)
 
 
+@pytest.mark.parametrize(
+    ("stack", "noise"),
+    [("P-885.51", {"voltage": 0.01}), ("WYDS0808020", {"load_force": 1.0}), ("PTBS200", {})],
+)
+def test_the_observer_of_a_stack_forgets_its_start(stack: str, noise: dict[str, float]) -> None:
+    point = psa.linearize(psa.stack_model(stack), {"voltage": 60.0})
+    made = psa.observer(
+        point, input_noise={"voltage": 0.1, **noise}, output_noise={"displacement": 1e-8}, step=1e-5
+    )
+    values = {
+        **dict(zip(point.input_names, point.u, strict=True)),
+        "measured_displacement": point.y[point.output_names.index("displacement")],
+    }
+    filtered = psa.linearize(made, values, states=dict.fromkeys(made.state_names, 0.0))
+    assert max(filtered.poles.real) < min(0.0, 0.5 * max(point.poles.real))
+    for size in (0.0, -1.0):
+        with pytest.raises(psa.InputError, match="give a positive number"):
+            psa.observer(point, input_noise=noise, output_noise={"displacement": size}, step=1e-5)
+
+
+def test_a_controller_that_is_none_is_refused() -> None:
+    for controller in ([2.0, 50.0], [1.0]), ([1.0], []):
+        with pytest.raises(psa.InputError, match="no transfer function"):
+            psa.margins(psa.linearize(mass()), controller, output="place")
+
+
 def test_the_command_writes_what_others_read(tmp_path: Path) -> None:
     files = [tmp_path / n for n in ("lin.mat", "lin.json", "bode.png", "observer.fmu")]
     for output in files[:2]:
@@ -121,7 +147,7 @@ def test_the_command_writes_what_others_read(tmp_path: Path) -> None:
                 "linearize", "--stack", "P-885.51", "--at", "voltage=60", "-o", str(output),
                 "--figure", str(files[2]), "--controller", "20 8e7 / 1 0", "--from", "voltage",
                 "--to", "displacement", "--observer", str(files[3]), "--noise", "voltage=0.01",
-                "--noise", "displacement=1e-9", "--step", "1e-5",
+                "--noise", "displacement=1e-9", "--step", "10us",
             ],
         )  # fmt: skip
         assert result.exit_code == 0, result.output

@@ -1,9 +1,9 @@
 """Many devices: real work on two, jobs from tables, what is kept, what a failure does."""
 
+import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,12 +23,17 @@ from psa_casadi.common.processes import Processes
 from psa_casadi.common.strict_json import json_text
 from psa_casadi.devices import executors
 from psa_casadi.devices.executors import outcomes
-from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given
+from psa_casadi.devices.jobs import DeviceOutcome, DeviceTask, jobs_given, key_of
 from psa_casadi.documents.files import identification_file
+from psa_casadi.population.population import population
 from psa_casadi.simulation.side_by_side import threads
-from tests.contract.helpers import command
+from tests.any_model import own_plants as plants
+from tests.any_model.own_models import motor
+from tests.contract.helpers import PSA, command
+from tests.records.record_files import write
+from tests.report.html_page import read_page
 from tests.report.report_cases import identification
-from tests.tiers import slow
+from tests.tiers import posix, slow
 
 TIME = np.arange(240) * 1e-2
 VOLTAGE = (50.0 - 50.0 * np.cos(4 * np.pi * TIME)) * np.exp(-0.2 * TIME)
@@ -122,7 +127,7 @@ def test_every_device_has_one_thread_and_its_failure_is_its_result(
     assert ended["d2"].problems == ("one", "two")
 
 
-def test_an_interrupt_ends_the_threads_and_says_what_is_kept(
+def test_an_interrupt_ends_the_threads_and_names_what_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ended = threading.Event()
@@ -202,11 +207,9 @@ def test_a_damaged_result_is_named_and_made_again(
 
 
 def test_a_table_of_jobs_is_read(records: Path) -> None:
-    (records / "jobs.csv").write_text(
-        "device,batch,date,files\n"
-        "first,B1,2026-03-14,\nA2,B2,2026-04-01T12:00,second.csv;first/loops.csv\nA2,B2,2026-04-01,"
-        "third.csv\n"
-    )
+    write(records / "jobs.csv", "device,batch,date,files", "first,B1,2026-03-14,",
+          "A2,B2,2026-04-01T12:00,second.csv;first/loops.csv",
+          "A2,B2,2026-04-01,third.csv")  # fmt: skip
     first, second = jobs_given(records)
     assert (first.batch, first.day) == ("B1", date(2026, 3, 14))
     assert [Path(f).name for f in first.files] == ["loops.csv"]
@@ -238,7 +241,7 @@ def test_mistakes_in_a_table_are_reported(table: str, problem: str, records: Pat
     assert problem in str(error.value)
 
 
-def test_an_executor_that_takes_no_more_is_told(tmp_path: Path) -> None:
+def test_an_executor_that_takes_no_more_is_an_error(tmp_path: Path) -> None:
     pool = ThreadPoolExecutor(1)
     pool.shutdown()
     with pytest.raises(psa.MachineError, match="takes no more work"):
@@ -270,7 +273,7 @@ def test_an_executor_that_is_lost_is_no_result_of_a_device(
 
 @slow
 @pytest.mark.parametrize("address", ["junk", "tls://127.0.0.1:1"])
-def test_an_address_of_no_scheduler_is_told_in_a_sentence(
+def test_an_address_of_no_scheduler_is_an_error_in_a_sentence(
     address: str, records: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed")
@@ -281,7 +284,7 @@ def test_an_address_of_no_scheduler_is_told_in_a_sentence(
     assert f"The scheduler at {address} cannot be reached" in output
 
 
-def test_dask_that_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dask_that_is_missing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(name: str) -> Any:
         raise ImportError(name)
 
@@ -309,17 +312,15 @@ def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
 
 
 @slow
-def test_processes_of_the_standard_library_do_it_too(records: Path, tmp_path: Path) -> None:
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        result = psa.batch(records, tmp_path / "out", executor=pool)
-    assert result.counts == {"done": 2, "refused": 1}
-
-
-@slow
-def test_a_cluster_of_dask_does_it_too(records: Path, tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    with executors.dask_client("local", 2) as client:
-        result = psa.batch(records, tmp_path / "out", executor=client)
+@pytest.mark.parametrize("kind", ["processes", "dask"])
+def test_other_executors_do_it_too(kind: str, records: Path, tmp_path: Path) -> None:
+    if kind == "dask":
+        pytest.importorskip("distributed")
+        pool: Any = executors.dask_client("local", 2)
+    else:
+        pool = ProcessPoolExecutor(2, mp_context=get_context("spawn"))
+    with pool as executor:
+        result = psa.batch(records, tmp_path / "out", executor=executor)
     assert result.counts == {"done": 2, "refused": 1}
     assert psa.load_model(tmp_path / "out" / "first" / "model.json").provenance.free
 
@@ -338,15 +339,14 @@ def test_devices_are_diagnosed(records: Path, tmp_path: Path) -> None:
 
 def batch_command(folder: Path, out: Path, *more: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "psa_casadi.cli", "batch", str(folder), "-o", str(out),
-         "--workers", "1", *more],
+        [*PSA, "batch", str(folder), "-o", str(out), "--workers", "1", *more],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "PYTHONUNBUFFERED": "1"},
     )  # fmt: skip
 
 
 @slow
-@pytest.mark.skipif(sys.platform == "win32", reason="signals cannot be sent to one process")
+@posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) -> None:
     folder, out = tmp_path / "records", tmp_path / "out"
@@ -371,3 +371,56 @@ def test_a_run_that_was_ended_goes_on(number: signal.Signals, tmp_path: Path) ->
     assert before.items() <= stamps(out).items()
     assert len(list(out.glob("*/device.json"))) == 3
     assert not list(out.rglob(".psa_casadi-*"))
+
+
+# Devices that are no stacks: another model, fitted to the records of each
+
+
+def write_motor(path: Path, seed: int, inertia: float = 3e-5, friction: float = 0.0) -> None:
+    record = plants.motor(seed, friction, inertia=inertia)
+    table = np.column_stack([record.time, *record.columns.values()])[:800]
+    names = ["time [s]", "voltage [V]", "w [rad/s]", "i [A]"]
+    np.savetxt(path, table, delimiter=",", header=",".join(names), comments="")
+
+
+def test_a_heavy_motor_is_an_outlier_of_a_population(tmp_path: Path) -> None:
+    folder = tmp_path / "records"
+    folder.mkdir()
+    for k in range(6):
+        write_motor(folder / f"m{k}.csv", seed=k + 1, inertia=3.3e-5 if k == 4 else 3e-5)
+    (folder / "none.csv").write_text("time,voltage\n" + "\n".join(f"{k},1" for k in range(40)))
+    options = psa.Options(model=motor(), words={"starts": 1, "known_start": True})
+    done = psa.batch(folder, tmp_path / "results", options=options, workers=2)
+    assert done.counts == {"done": 6, "refused": 1}
+    assert "no output of the model 'motor'" in " ".join(done.devices[-1].problems)
+    content = json.loads((tmp_path / "results" / "m1" / "identification.json").read_text("utf-8"))
+    alone = psa.identify(motor(), folder / "m1.csv", starts=1, known_start=True)
+    for name, parameter in content["parameters"].items():
+        assert parameter["value"] == pytest.approx(alone.model.values[name], rel=1e-6)
+    saved = psa.load_model(tmp_path / "results" / "m1" / "model.json")
+    assert saved.values == pytest.approx(alone.model.values, rel=1e-6)
+    summary = (tmp_path / "results" / "summary.csv").read_text("utf-8").splitlines()
+    assert "J [kg.m2]" in summary[0]
+    assert not [n for n in summary[0].split(",") if "[m]" in n or "[times" in n]  # nothing in them
+    result = population(done.findings)
+    assert {(o.device, o.parameter) for o in result.outliers} == {("m4", "J")}
+    psa.write_population(result, tmp_path / "page.html")
+    assert "1 of 6 devices stands out: m4." in read_page(tmp_path / "page.html")[1].text
+    again = psa.batch(folder, tmp_path / "results", options=options, workers=1)
+    assert again.kept == 7
+    jobs = [psa.Job("m1", (str(folder / "m1.csv"),))]
+    other = psa.Options(model=motor().with_values({"b": 2e-5}), words=options.words)
+    assert key_of(jobs[0], other) != key_of(jobs[0], options)
+
+
+@slow
+def test_devices_that_are_no_stacks_are_diagnosed(tmp_path: Path) -> None:
+    jobs = []
+    for name, friction in (("dry", 0.012), ("oiled", 0.0)):
+        write_motor(tmp_path / f"{name}.csv", 2, friction=friction)
+        jobs.append(psa.Job(name, (str(tmp_path / f"{name}.csv"),)))
+    fewer = ["hysteresis", "stop", "curve", "delay", "bend", "lag", "saturation"]
+    options = psa.Options(work="diagnose", model=motor(), words={"leave_out": fewer})
+    done = psa.batch(jobs, tmp_path / "results", options=options, workers=1)
+    assert [f.verdict for f in done.findings] == ["cause_named", "adequate"]
+    assert [c.effect for c in done.findings[0].causes] == ["friction_in_speed"]

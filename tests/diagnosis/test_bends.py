@@ -13,7 +13,7 @@ from psa_casadi.cli.app import app
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.experiment import resolving_experiment
 from psa_casadi.diagnosis.pack import STACK, Task
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records.split import split
 from tests.studies.plants.make import make_record
@@ -35,7 +35,7 @@ def test_bends_are_equivalent_where_no_resonance_shows(
     displayed = psa.simulate(model, time, voltage).displacement
     experiments = (split(psa.Record(name="r", time=time, voltage=voltage, displacement=displayed)),)
     result = fit(model, experiments, free, sigma=[1e-8], evaluations=2)
-    groups = Task(experiments, TABLE, STACK).indistinguishable(result)
+    groups = Task(TABLE, STACK).indistinguishable(result)
     assert tuple(tuple(sorted(group)) for group in groups) == equivalent
 
 
@@ -53,7 +53,7 @@ def test_a_bend_is_not_blamed_on_the_sensor_alone(tmp_path: Path) -> None:
     assert cause.confidence == pytest.approx(one, rel=1e-3)
     assert one == pytest.approx(other, rel=1e-3)
     assert "no voltage below the resonances separates" in result.next_experiment.why
-    output, _ = one_of_each(result.contenders, result.experiments)
+    output, _ = one_of_each(result.contenders)
     assert len(output) == 1
     with pytest.raises(psa.InputError, match="bend the same curve"):
         resolving_experiment(result)

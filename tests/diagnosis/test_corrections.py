@@ -9,7 +9,7 @@ import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
-from psa_casadi.diagnosis.held_out import budget, held_out_rms, removed_from, stack_budget
+from psa_casadi.diagnosis.held_out import Compared, Removed, held_out_rms
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.model_file import dumps, loads
 from psa_casadi.records.split import Experiment, split
@@ -28,7 +28,7 @@ def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
 
 
 def _held(fit: Fit, experiments: tuple[Experiment, ...]) -> float:
-    return held_out_rms(experiments, fit.predicted(experiments))
+    return held_out_rms(experiments, fit.predicted())
 
 
 @pytest.fixture(scope="module")
@@ -74,13 +74,13 @@ HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
 def test_what_is_hidden_is_detected_at_its_port(hidden: str, clean: FloatArray) -> None:
     y = _measured(clean, HIDDEN[hidden](clean))
     result, experiments, colour = _fitted(y)
-    observed = corrections(result, experiments, colour)
-    base = (np.asarray(result.predicted(experiments)[0]),)
+    observed = corrections(result, colour)
+    base = (np.asarray(result.predicted()[0]),)
     patch = best_of(observed, experiments, [_held(result, experiments)], colour)
     assert patch is not None
     assert hidden in (patch.name, *patch.open_to)
-    removed = removed_from(experiments, base, [NOISE])
-    spent = budget(removed, base, [], (patch.name, patch.predicted))
+    removed = Removed(experiments, base, [NOISE])
+    spent = removed.budget(base, [], (patch.name, patch.predicted))
     assert spent.unnamed is not None
     assert spent.unnamed.share > 0.7
     assert spent.unnamed.interval[0] > 0.0
@@ -90,15 +90,15 @@ def test_what_is_hidden_is_detected_at_its_port(hidden: str, clean: FloatArray) 
 def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatArray) -> None:
     """In the model it does what the linear estimate promises; the file reads back the same."""
     result, experiments, colour = _fitted(_measured(clean, HIDDEN[hidden](clean)))
-    predicted = result.predicted(experiments)
+    predicted = result.predicted()
     held = held_out_rms(experiments, predicted)
     kind, port = hidden.split(" at the ")
-    items = [c for c in corrections(result, experiments, colour) if c.kind == kind]
+    items = [c for c in corrections(result, colour) if c.kind == kind]
     items = [c for c in items if c.port == port]
     patch = best_of(items, experiments, [held], colour)
     assert isinstance(patch, Patch)
-    again = with_patch(result, patch, experiments, predicted)
-    after = held_out_rms(experiments, again.predicted(experiments))
+    again = with_patch(result, patch, predicted)
+    after = held_out_rms(experiments, again.predicted())
     assert after**2 - NOISE**2 < 0.3 * (held**2 - NOISE**2)
     model = loads(dumps(again.model))
     assert model.values == again.model.values
@@ -108,17 +108,17 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
 
 def test_resonances_have_no_separate_component(clean: FloatArray) -> None:
     result, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
-    modes = [c for c in corrections(result, experiments, colour) if c.kind == "modes"]
+    modes = [c for c in corrections(result, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
     with pytest.raises(psa.InputError, match="no form that a model could hold"):
-        with_patch(result, patch, experiments, result.predicted(experiments))
+        with_patch(result, patch, result.predicted())
 
 
 def test_noise_gets_no_correction(clean: FloatArray) -> None:
     noise = NOISE * np.random.default_rng(3).standard_normal(TIME.size)
     result, experiments, colour = _fitted(clean + noise)
-    observed = corrections(result, experiments, colour)
+    observed = corrections(result, colour)
     assert max(c.evidence for c in observed) < 3.0
     assert best_of(observed, experiments, [_held(result, experiments)], colour) is None
 
@@ -138,8 +138,8 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))
     without = [("one", (truth + one,)), ("other", (truth + other,))]
     base, extended = (truth + one + other,), (truth,)
-    result = budget(removed_from(experiments, base, [NOISE]), extended, without, None)
-    spent = stack_budget(result, experiments, base, extended, NOISE)
+    result = Removed(experiments, base, [NOISE]).budget(extended, without, None)
+    spent = Compared(experiments, base, extended).in_lengths(result, NOISE)
     assert spent.excess_rms_m == pytest.approx(5.0 * NOISE, rel=0.05)
     assert [s.share for s in spent.causes] == pytest.approx([9 / 25, 16 / 25], abs=0.04)
     assert spent.together.share == pytest.approx(1.0, abs=0.02)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.corrections import KINDS, Patch
-from psa_casadi.diagnosis.families import CauseEvidence, families, place_and_kind
+from psa_casadi.diagnosis.corrections import KINDS, CauseEvidence, Patch, families, place_and_kind
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.report.words.verdict_words import family_sentence

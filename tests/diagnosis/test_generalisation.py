@@ -9,9 +9,9 @@ from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.confirmation import held_out_excess
+from psa_casadi.diagnosis.colour import OwnColour, own_colour
+from psa_casadi.diagnosis.held_out import held_out_excess
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.records.split import Experiment, divided, split
@@ -46,10 +46,10 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
         split(psa.Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),
     )
     used = error[experiments[0].used]
-    observed = replace(result, residuals=used)
+    observed = replace(result, experiments=experiments, residuals=used)
     colour = _own(experiments, [error])
     noise = noise_floor([experiments[0].record], [error])
-    return held_out_excess(observed, experiments, (clean,), colour, noise, LIMITS).factor
+    return held_out_excess(observed, (clean,), colour, noise, LIMITS).factor
 
 
 @slow
@@ -96,14 +96,12 @@ def test_a_held_out_record_with_different_noise_is_no_reason_to_doubt(
         lead = experiments[1].known
         offset = float(np.mean(errors[1][:samples][lead]))
         sigma = tuple(float(np.std(e)) for e in errors)
-        observed = replace(result, residuals=errors[0], sigma=sigma)
+        observed = replace(result, experiments=experiments, residuals=errors[0], sigma=sigma)
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
         colour = _own(experiments, left)
-        items.append(
-            held_out_excess(observed, experiments, predicted, colour, noise, LIMITS).factor
-        )
+        items.append(held_out_excess(observed, predicted, colour, noise, LIMITS).factor)
     assert items == [1.0] * 25
 
 

@@ -88,7 +88,7 @@ def test_what_the_device_adds_is_predicted_where_the_voltage_is_another() -> Non
         records.append(psa.Record(name="r", time=time, voltage=v, displacement=displayed))
     experiments = (whole(records[0]),)
     held = fit(model, experiments, (), sigma=[1e-7])
-    healthy = Healthy(held, experiments)
+    healthy = Healthy(held)
     (added,), places = healthy.adds(records[1:])
     observed = healthy.shows(records[1])
     assert places == 0
@@ -110,5 +110,5 @@ def test_a_voltage_that_the_reference_does_not_show_is_refused(sound: psa.Record
 
 def test_a_user_model_takes_no_reference(sound: psa.Record) -> None:
     words: Any = {"reference": sound}
-    with pytest.raises(psa.InputError, match="'reference' is not among the words for a model"):
+    with pytest.raises(psa.InputError, match="'reference' is not among the arguments for"):
         psa.diagnose(oven(), [sound], **words)

@@ -6,9 +6,8 @@ from scipy.stats import chi2
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.colour import Colour, colour_of, left_correlation
-from psa_casadi.diagnosis.omnibus import omnibus
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
+from psa_casadi.diagnosis.colour import Colour, OwnColour, colour_of, left_correlation, own_colour
+from psa_casadi.diagnosis.noise import omnibus
 from psa_casadi.diagnosis.probes import Span, residual_jumps
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.identification.fitting.fit import fit
@@ -162,5 +161,5 @@ def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
     place = float(x.min() + share * np.ptp(x))
     reading = x + 2e-8 * (x > place) + noise + 3e-6
     experiments = (whole(psa.Record(name="r", time=t, voltage=voltage, displacement=reading)),)
-    places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]), experiments)
+    places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]))
     assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)

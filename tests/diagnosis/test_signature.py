@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psa_casadi.diagnosis.signature import signature
+from psa_casadi.diagnosis.remedy import signature
 from psa_casadi.model.effects import EFFECTS
 from tests.contract.helpers import refused
 

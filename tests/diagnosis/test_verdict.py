@@ -8,9 +8,8 @@ from scipy.signal import sawtooth
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.confirmation import coverage_notes, unconfirmed
 from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.diagnosis.held_out import Gain, gain_of, lost_elsewhere
+from psa_casadi.diagnosis.held_out import Compared, Gain, coverage_notes, unconfirmed
 from psa_casadi.diagnosis.result import Cause
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.diagnosis.verdict import next_experiment, useful_records
@@ -213,11 +212,11 @@ def test_gain_is_the_reduction_of_the_held_out_rms() -> None:
     )
     experiment = Experiment(record, ~held, held)
     base = truth + 0.1 * rng.standard_normal(N)
-    gain = gain_of([experiment], [base], [truth])
+    gain = Compared([experiment], [base], [truth]).gain
     assert gain.holdout_rms_reduction_percent == pytest.approx(90, abs=1.5)
     assert gain.interval[0] < gain.holdout_rms_reduction_percent < gain.interval[1]
     assert gain.held_out_records == 0
-    assert gain_of([experiment] * 4, [base] * 4, [truth] * 4).held_out_records == 4
+    assert Compared([experiment] * 4, [base] * 4, [truth] * 4).gain.held_out_records == 4
 
 
 def test_what_the_other_parts_lose_is_counted_without_the_one_that_gains_most() -> None:
@@ -228,9 +227,10 @@ def test_what_the_other_parts_lose_is_counted_without_the_one_that_gains_most() 
     experiment = Experiment(record, ~held, held)
     first = np.arange(N) < N - 1000 + 125
     base, after = np.where(first, 10.0, 1.0), np.where(first, 1.0, 1.1)
-    lost = lost_elsewhere([experiment], [base], [after], 2.0)
+    lost = Compared([experiment], [base], [after]).lost_elsewhere(2.0)
     assert lost == pytest.approx(875 / 2.0 * np.log(1.1))
-    assert lost_elsewhere([experiment], [base], [np.ones(N)], 2.0) == pytest.approx(0.0, abs=1e-9)
+    none = Compared([experiment], [base], [np.ones(N)]).lost_elsewhere(2.0)
+    assert none == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_slow_triangle_is_blind_to_fast_effects(

@@ -21,18 +21,18 @@ from psa_casadi.model.component import Component
 from psa_casadi.model.components import BASE, COMPONENTS, SIMPLIFIED
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.effects.drive import CHARGE_LEAKAGE, DRIVE_LAG, VOLTAGE_SATURATION
-from psa_casadi.model.effects.environment import MAINS_HUM, TEMPERATURE
-from psa_casadi.model.effects.hysteresis import HYSTERESIS_MEMORY, RATE_DEPENDENT_HYSTERESIS
-from psa_casadi.model.effects.mechanics import BACKLASH, LOAD_STIFFNESS, PRELOAD_LOSS
-from psa_casadi.model.effects.sensor import SENSOR_JUMP, SENSOR_NONLINEARITY, SENSOR_RIPPLE
+from psa_casadi.model.effects.ageing import ageing, self_heating
+from psa_casadi.model.effects.drive import charge_leakage, drive_lag, voltage_saturation
+from psa_casadi.model.effects.environment import mains_hum, temperature
+from psa_casadi.model.effects.mechanics import backlash, load_stiffness, preload_loss
+from psa_casadi.model.effects.sensor import sensor_jump, sensor_nonlinearity, sensor_ripple
 from psa_casadi.model.effects.strain import (
-    AGEING,
-    FIELD_DEPENDENT_GAIN,
-    SATURATION_OF_STRAIN,
-    SELF_HEATING,
+    field_dependent_gain,
+    hysteresis_memory,
+    rate_dependent_hysteresis,
+    saturation_of_strain,
 )
-from psa_casadi.model.scales import stiffness_scale, stroke_scale
+from psa_casadi.model.shapes import stiffness_scale, stroke_scale
 from psa_casadi.model.stacks import STACKS
 from psa_casadi.simulation.compiler import functions_of
 from psa_casadi.simulation.simulate import simulate
@@ -108,7 +108,7 @@ def test_loop_width_follows_the_logarithm_of_rate(peak: float) -> None:
 
     def width_and_stroke(gain: float, frequency: float) -> tuple[float, float]:
         model = stack("P-885.51", **QUICK).with_effect(
-            RATE_DEPENDENT_HYSTERESIS, {"rate_gain": gain, "rate_onset": 1e-3}
+            rate_dependent_hysteresis, {"rate_gain": gain, "rate_onset": 1e-3}
         )
         t, voltage = triangle(frequency, peak)
         result = driven(model, t, voltage)
@@ -130,10 +130,10 @@ def test_rayleigh_gain_grows_with_amplitude() -> None:
     gains = []
     for peak in peaks:
         t, voltage = triangle(1.0, peak, cycles=1)
-        gains.append(np.ptp(driven(linear(FIELD_DEPENDENT_GAIN, 0.1), t, voltage).y[:, -1]) / peak)
+        gains.append(np.ptp(driven(linear(field_dependent_gain, 0.1), t, voltage).y[:, -1]) / peak)
     slope, start = np.polyfit(peaks / 120.0, gains, 1)
     assert slope / start == pytest.approx(0.1, rel=0.01)
-    small, large = (third_harmonic(FIELD_DEPENDENT_GAIN, 0.1, peak) for peak in (50.0, 100.0))
+    small, large = (third_harmonic(field_dependent_gain, 0.1, peak) for peak in (50.0, 100.0))
     assert large[1] / small[1] == pytest.approx(4.0, rel=0.01)
     assert large[1] / large[0] == pytest.approx(
         -8 / (15 * np.pi) * 0.1 / (1.2 + 0.1 * 8 / (3 * np.pi)), rel=0.01
@@ -145,9 +145,9 @@ def test_saturation_flattens_both_branches() -> None:
     full = []
     for gain in (0.0, 0.2):
         t, voltage = triangle(1.0, 120.0, cycles=1)
-        full.append(np.ptp(driven(linear(SATURATION_OF_STRAIN, gain), t, voltage).y[:, -1]))
+        full.append(np.ptp(driven(linear(saturation_of_strain, gain), t, voltage).y[:, -1]))
     assert full[1] / full[0] == pytest.approx(1 / np.sqrt(1.2), rel=1e-4)
-    first, third = third_harmonic(SATURATION_OF_STRAIN, 0.02, 60.0)
+    first, third = third_harmonic(saturation_of_strain, 0.02, 60.0)
     assert third / first == pytest.approx(0.02 / 8 * 0.25, rel=0.01)
 
 
@@ -159,7 +159,7 @@ def test_load_hardens_with_displacement(
     """k x + h k_s x^3 / x_s^2 = the force that holds the linear stack there, whoever exerts it."""
     t = np.linspace(0.0, 1.0, 201)
     angle, gain = np.arctan(0.2), 0.05  # a pure cubic
-    model, plain = (linear(LOAD_STIFFNESS, g, base, load_angle=angle) for g in (gain, 0.0))
+    model, plain = (linear(load_stiffness, g, base, load_angle=angle) for g in (gain, 0.0))
     x, free = (
         driven(m, t, volt * np.minimum(t / 0.5, 1.0), force).y[-1, -1] for m in (model, plain)
     )
@@ -178,10 +178,10 @@ def test_contact_kinks_the_curve_at_one_displacement(base: tuple[Component, ...]
     """Slope 1 below, k / (k + g k_s) above, meeting at contact_position of the stroke."""
     t, voltage = triangle(0.5, 120.0, cycles=1)
     touched, free = (
-        driven(linear(PRELOAD_LOSS, g, base, contact_position=0.45), t, voltage).y[:, -1]
+        driven(linear(preload_loss, g, base, contact_position=0.45), t, voltage).y[:, -1]
         for g in (0.25, 0.0)
     )
-    p = linear(PRELOAD_LOSS, 0.25, base).values
+    p = linear(preload_loss, 0.25, base).values
     k, k_s = p["k_B"] if "k_B" in p else p["k"], stiffness_scale(p)
     x_c = 0.45 * stroke_scale(p)
     for branch in (slice(2, 199), slice(202, 399)):
@@ -205,7 +205,7 @@ def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
     """Of ideal plays with the same weights and thresholds, to the roundness of its stops."""
     values = {f"memory_{name}_{k}": 0.0 for name in ("play", "square", "cube") for k in range(3)}
     values |= {f"memory_{name}_{k}": w for name, row in weights.items() for k, w in enumerate(row)}
-    plain = linear(HYSTERESIS_MEMORY, 0.0)
+    plain = linear(hysteresis_memory, 0.0)
     model = plain.with_values({"memory_gain": 1.0, "memory_threshold": 0.02, **values})
     t = np.linspace(0.0, 60.0, 6001)
     voltage = 60.0 * (1.0 - np.cos(2 * np.pi * t / 20.0)) * (1.0 - t / 90.0)
@@ -223,7 +223,7 @@ def test_memory_is_a_sum_of_plays_their_squares_and_cubes(
 @pytest.mark.parametrize("peak", [30.0, 120.0])
 def test_backlash_dwells_over_the_gap(peak: float) -> None:
     """Whatever the amplitude: none of the first w of motion, 4 w of the first 6 w get through."""
-    model = linear(BACKLASH, 1.0, backlash_width=0.01)
+    model = linear(backlash, 1.0, backlash_width=0.01)
     w = 0.01 * stroke_scale(model.values)
     t, voltage = triangle(1.0, peak)
     result = driven(model, t, voltage)
@@ -246,7 +246,7 @@ def test_self_heating_climbs_and_recovers() -> None:
     t = np.arange(6001) / 1000.0
     voltage = np.where(t < 3.0, 60.0 * (1.0 - np.cos(2 * np.pi * 20.0 * t)), 60.0)
     model = stack("P-885.51", **{**QUICK, "delta": 0.0, "gamma": 0.0}).with_effect(
-        SELF_HEATING, {"heating_gain": 0.02, "heating_time": cooling}
+        self_heating, {"heating_gain": 0.02, "heating_time": cooling}
     )
     result = driven(model, t, voltage)
     states = dict(zip(model.state_names, result.x.T, strict=True))
@@ -267,7 +267,7 @@ def test_self_heating_climbs_and_recovers() -> None:
 def test_ageing_is_a_straight_line_in_log_time() -> None:
     """Of ageing_gain of the gain per decade, and nothing before time zero."""
     t = np.concatenate([[-20.0, -10.0, 0.0], np.geomspace(0.01, 100.0, 60)])
-    model = linear(AGEING, 0.02, ageing_time=1e-3)
+    model = linear(ageing, 0.02, ageing_time=1e-3)
     x = simulate(model, t, np.full(t.size, 80.0)).displacement
     fresh = simulate(model.with_values({"ageing_gain": 0.0}), t, np.full(t.size, 80.0)).displacement
     lost = 1.0 - x / fresh
@@ -343,10 +343,10 @@ def test_no_gain_within_its_bounds_runs_away(effect: Component, end: int) -> Non
 @pytest.mark.parametrize(
     ("effect", "base"),
     [
-        *(pytest.param(e, BASE, id=e.name) for e in PLANT if e is not AGEING),
+        *(pytest.param(e, BASE, id=e.name) for e in PLANT if e is not ageing),
         *(
             pytest.param(e, SIMPLIFIED, id=f"{e.name}, single mass", marks=slow)
-            for e in (LOAD_STIFFNESS, PRELOAD_LOSS, BACKLASH, HYSTERESIS_MEMORY)
+            for e in (load_stiffness, preload_loss, backlash, hysteresis_memory)
         ),
     ],
 )
@@ -463,7 +463,7 @@ def test_a_clip_makes_flat_tops_at_its_level(level: float) -> None:
     """Behind a hard clip the stack does what it does at the clipped command: twice a flat top."""
     t = np.linspace(0.0, 1.0, 2001)
     voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t))
-    hard = simulated(with_effect(VOLTAGE_SATURATION, clip_gain=1.0, clip_level=level), t, voltage)
+    hard = simulated(with_effect(voltage_saturation, clip_gain=1.0, clip_level=level), t, voltage)
     clipped = simulated(stack(STACK), t, np.minimum(voltage, 120.0 * level))
     width, excess = 0.005 * 120.0, voltage - 120.0 * level
     rounding = width * np.log1p(np.exp(-np.abs(excess) / width))  # of the corner [V]
@@ -489,7 +489,7 @@ def test_a_drive_lag_joins_the_base_at_every_amplitude(
     voltage = amplitude * np.sin(2 * np.pi * frequency * t)
     late = t > 20.0 / frequency
     responses = []
-    lagging = with_effect(DRIVE_LAG, drive_lag_time=lag, drive_lag_shape=shape)
+    lagging = with_effect(drive_lag, drive_lag_time=lag, drive_lag_shape=shape)
     for model in (lagging, stack(STACK)):
         displayed = simulated(model.with_values(LINEAR), t, voltage)["measured_displacement"]
         responses.append(tone(t[late], displayed[late], frequency))
@@ -502,7 +502,7 @@ def test_a_drive_lag_joins_the_base_at_every_amplitude(
 def test_a_leaking_charge_drive_droops_to_what_does_not_leak() -> None:
     """u = G v (1 - g (1 - exp(-t/T))) after a step from rest, and G v (1 - g) long after one."""
     gain, time = 0.3, 2.0
-    model = with_effect(CHARGE_LEAKAGE, leak_gain=gain, leak_time=time).with_values(LINEAR)
+    model = with_effect(charge_leakage, leak_gain=gain, leak_time=time).with_values(LINEAR)
     t = np.linspace(0.0, 20.0, 4001)
     voltage = np.where(t > 0.0, 100.0, 0.0)
     late = t > 0.02
@@ -521,7 +521,7 @@ def test_a_bent_sensor_reads_a_function_of_the_displacement_alone(
 ) -> None:
     """The bend is a Legendre series on 0 to 1 without its constant and its slope."""
     model = with_effect(
-        SENSOR_NONLINEARITY, nonlinearity_gain=0.01, nonlinearity_angle=angle,
+        sensor_nonlinearity, nonlinearity_gain=0.01, nonlinearity_angle=angle,
         nonlinearity_wave=wave,
     )  # fmt: skip
     t = np.linspace(0.0, 2.0, 2001)
@@ -558,7 +558,7 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
     """Its first harmonic has the gain as amplitude, the second what its two shares say."""
     period = 1.3e-6
     model = with_effect(
-        SENSOR_RIPPLE, ripple_gain=2e-8, ripple_period=period, ripple_phase=0.7,
+        sensor_ripple, ripple_gain=2e-8, ripple_period=period, ripple_phase=0.7,
         ripple_second_cosine=0.3, ripple_second_sine=-0.4,
     )  # fmt: skip
     x, residual = read_by_the_sensor(model)
@@ -574,7 +574,7 @@ def test_a_ripple_repeats_with_the_displacement_on_both_branches() -> None:
 
 def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() -> None:
     place = 4e-6
-    model = with_effect(SENSOR_JUMP, jump_gain=3e-8, jump_place=place, jump_width=0.003)
+    model = with_effect(sensor_jump, jump_gain=3e-8, jump_place=place, jump_width=0.003)
     width = 0.003 * stroke_scale(model.values)
     x, residual = read_by_the_sensor(model)
     far = np.abs(x - place) > 10 * width
@@ -588,7 +588,7 @@ def test_a_jump_is_a_step_of_the_reading_at_one_displacement_on_both_branches() 
 
 def test_hum_is_a_sine_that_keeps_amplitude_and_phase_for_a_thousand_periods() -> None:
     """At the fit's tolerance and a sample rate below the line, moving voltage or not."""
-    model = with_effect(MAINS_HUM, hum_gain=2e-8, hum_frequency=50.0)
+    model = with_effect(mains_hum, hum_gain=2e-8, hum_frequency=50.0)
     t: FloatArray = 0.3 + 0.011 * np.arange(
         2001.0
     )  # 90.9 samples per second: 50 Hz shows at its alias
@@ -608,7 +608,7 @@ def test_expansion_follows_the_temperature_with_its_lag(single: bool) -> None:
         kept = {n: v for n, v in base.values.items() if n in psa.compose(psa.SIMPLIFIED).values}
         base = psa.compose(psa.SIMPLIFIED, kept)
     lag = 20.0
-    model = base.with_effect(TEMPERATURE, {"expansion_gain": 2e-3, "temperature_lag": lag})
+    model = base.with_effect(temperature, {"expansion_gain": 2e-3, "temperature_lag": lag})
     t = np.linspace(0.0, 1000.0, 1001)
     result = simulated(model, t, np.zeros_like(t), temperature=ROOM + 1.5 + 0.003 * t)
     displayed = result["measured_displacement"]
@@ -620,7 +620,7 @@ def test_expansion_follows_the_temperature_with_its_lag(single: bool) -> None:
 def test_the_gain_grows_with_temperature() -> None:
     """Without hysteresis, a slow voltage gives stroke v/u_rated (1 + ratio g dT) + g dT stroke."""
     values = {"expansion_gain": 2e-3, "temperature_gain_ratio": 1.5}
-    model = with_effect(TEMPERATURE, **values).with_values(LINEAR)
+    model = with_effect(temperature, **values).with_values(LINEAR)
     t = np.linspace(0.0, 1000.0, 1001)
     rise, voltage = 0.01 * t, 60.0 * (1.0 - np.cos(0.1 * t))
     displayed = simulated(model, t, voltage, temperature=ROOM + rise)["measured_displacement"]

@@ -23,7 +23,7 @@ from build_scripts.measured_data import ROOT
 from psa_casadi.examples.index import Example, Script, examples
 from psa_casadi.export.fmu.platforms import chosen_platforms
 from psa_casadi.model.component import BALANCES
-from tests.contract.helpers import done
+from tests.contract.helpers import done, table
 from tests.export.modelica_runs import STUB, load
 from tests.tiers import slow
 
@@ -225,11 +225,9 @@ def test_the_shell_commands_of_fmpy(made: Path, monkeypatch: pytest.MonkeyPatch)
                 fmpy.cli.main()
         else:
             fmpy.cli.main()
-    two, three = (
-        np.genfromtxt(made / name, delimiter=",", names=True) for name in ("out.csv", "out3.csv")
-    )
-    assert two["displacement"].max() == pytest.approx(16e-6, rel=0.05)
-    assert three["displacement"][-1] == pytest.approx(two["displacement"][-1], rel=1e-3)
+    two, three = (table(made / name)["displacement"] for name in ("out.csv", "out3.csv"))
+    assert two.max() == pytest.approx(16e-6, rel=0.05)
+    assert three[-1] == pytest.approx(two[-1], rel=1e-3)
 
 
 @slow
@@ -270,19 +268,19 @@ def test_the_jobs_of_ci_are_yaml_and_their_commands_run(
     assert statement.endswith("ModelExchange differs by more than 0.1 % of the range\n")
 
 
-def test_scripts_are_found_on_a_page() -> None:
+def test_scripts_are_read_from_a_page() -> None:
     page = replace(examples()["fmpy"], text="# T\n```sh run.sh\na\nb\n```\n```console\n$ c\n```\n")
     assert page.scripts == (Script("sh", "run.sh", "a\nb\n"),)
 
 
-def test_the_page_on_own_effects_has_every_balance() -> None:
+def test_the_page_on_users_effects_has_every_balance() -> None:
     text = examples()["own_effect"].text
     rows = [f"| `{b.name}` | {b.unit} | {b.description} |" for b in BALANCES.values()]
     assert [row for row in rows if row not in text] == []
 
 
 @slow
-def test_an_own_effect_is_found_with_the_size_that_was_put_in(
+def test_a_users_effect_is_named_with_the_size_that_was_put_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

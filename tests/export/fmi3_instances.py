@@ -41,6 +41,21 @@ def loaded(name: str) -> Fmu:
     return Fmu(exported(name, 3))
 
 
+def saved(instance: Instance) -> bytes:
+    """Return an instance's state as bytes."""
+    snapshot = instance.fmi.getFMUState()
+    data: bytes = instance.fmi.serializeFMUState(snapshot)
+    instance.fmi.freeFMUState(snapshot)
+    return data
+
+
+def restore(instance: Instance, data: bytes) -> None:
+    """Go to a state from bytes."""
+    snapshot = instance.fmi.deserializeFMUState(data)
+    instance.fmi.setFMUState(snapshot)
+    instance.fmi.freeFMUState(snapshot)
+
+
 def try_step(instance: Instance, point: float, size: float) -> Step:
     """Do one communication step and return all its results, the status included."""
     event, end, early, reached = c_bool(), c_bool(), c_bool(), c_double()
@@ -89,20 +104,3 @@ class Instance3(importer.Instance):
         count = len(values)
         numbers = (c_double * count)(*values.values())
         return self.call("SetFloat64", self.references(list(values)), count, numbers, count)
-
-    def serialized(self) -> bytes:
-        """Return the instance's state as bytes."""
-        snapshot = self.fmi.getFMUState()
-        data: bytes = self.fmi.serializeFMUState(snapshot)
-        self.fmi.freeFMUState(snapshot)
-        return data
-
-    def try_restore(self, data: bytes) -> int:
-        """Go to a state from bytes; return the status of the first call that fails."""
-        try:
-            snapshot = self.fmi.deserializeFMUState(data)
-        except importer.FmuError as error:
-            return error.status
-        status = self.call("SetFMUState", snapshot)
-        self.fmi.freeFMUState(snapshot)
-        return status

@@ -9,12 +9,9 @@ from pathlib import Path
 
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.export.fmu.archive import export_fmu, write_archive
+import psa_casadi as psa
+from psa_casadi.export.fmu.archive import write_archive
 from psa_casadi.export.fmu.platforms import compile_library, host_platform
-from psa_casadi.model.components import BASE, COMPONENTS, SIMPLIFIED
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import STACKS
 from tests.model.sampled_models import controller, loop
 
 _FOLDER = tempfile.TemporaryDirectory()
@@ -28,21 +25,23 @@ _MANIPULATOR = {
 
 
 @cache
-def model_named(name: str) -> Model:
+def model_named(name: str) -> psa.Model:
     """Return a stack by its name, or one of: manipulator, single_mass, flexure, slow_creep.
 
     Or "every_effect": the base with all effects, each with a small gain; or "loop", "controller":
     sampled ones.
     """
-    if name in STACKS:
-        return compose(BASE, {k: figure.value for k, figure in STACKS[name].values.items()})
-    gains = {c.gain: 1e-3 for c in EFFECTS.values() if c.gain}
-    made: dict[str, Callable[[], Model]] = {
-        "manipulator": lambda: compose(BASE, _MANIPULATOR),
-        "single_mass": lambda: compose(SIMPLIFIED),
-        "flexure": lambda: compose([COMPONENTS["flexure"]], name="flexure"),
-        "every_effect": lambda: compose((*BASE, *EFFECTS.values()), gains, name=name),
-        "slow_creep": lambda: compose((*BASE, EFFECTS["slow_creep"]), {"creep_gain": 0.05}),
+    if name in psa.STACKS:
+        figures = psa.STACKS[name].values
+        return psa.compose(psa.BASE, {k: figure.value for k, figure in figures.items()})
+    gains = {c.gain: 1e-3 for c in psa.EFFECTS.values() if c.gain}
+    creep = psa.EFFECTS["slow_creep"]
+    made: dict[str, Callable[[], psa.Model]] = {
+        "manipulator": lambda: psa.compose(psa.BASE, _MANIPULATOR),
+        "single_mass": lambda: psa.compose(psa.SIMPLIFIED),
+        "flexure": lambda: psa.compose([psa.COMPONENTS["flexure"]], name="flexure"),
+        "every_effect": lambda: psa.compose((*psa.BASE, *psa.EFFECTS.values()), gains, name=name),
+        "slow_creep": lambda: psa.compose((*psa.BASE, creep), {"creep_gain": 0.05}),
         "loop": loop,
         "controller": controller,
     }
@@ -52,7 +51,7 @@ def model_named(name: str) -> Model:
 @cache
 def exported(name: str, fmi: int = 2) -> Path:
     """Return the FMU of a named model, FMI 2.0 or 3.0."""
-    return export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}_{fmi}.fmu", fmi=fmi)
+    return psa.export_fmu(model_named(name), Path(_FOLDER.name) / f"{name}_{fmi}.fmu", fmi=fmi)
 
 
 def files_inside(path: Path) -> dict[str, bytes]:

@@ -1,4 +1,4 @@
-"""A master of SSP archives: all FMUs of a system stepped side by side (Jacobi's scheme).
+"""A master of SSP archives, and systems: all FMUs are stepped side by side (Jacobi's scheme).
 
 fmpy's passes values on after a step only, and reads no parameter sets. Here, at every
 communication point, the parts exchange their outputs in the order in which outputs depend on
@@ -12,20 +12,25 @@ import importlib.metadata
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import numpy as np
 from fmpy.ssp.ssd import read_ssd
+from scipy.integrate import solve_ivp
 
+import psa_casadi as psa
 from psa_casadi.common.files import temporary_folder
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.archive import unpack
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu, FmuError
 from psa_casadi.export.importer.masters import Signals
 from psa_casadi.export.ssp import OUTSIDE, Port, Wire
+from tests.export.fmu_models import model_named
 
 #: Multiple of a port's nominal size beyond which a co-simulation counts as blown up.
 _BEYOND = 1e3
@@ -215,3 +220,59 @@ def load_ecos() -> Any | None:
         return import_module("ecospy")
     except (importlib.metadata.PackageNotFoundError, ImportError, OSError):
         return None
+
+
+# Systems and their archives, each exported once per process
+
+_FOLDER = TemporaryDirectory()
+
+#: Stack, end [s] and rise of the voltage [V/s] of the pushed stage.
+STACK, END, RATE = "P-885.51", 4e-4, 2e5
+
+
+def pushed_stage() -> psa.System:
+    """Return a stack that pushes on a flexure: two parts in a loop."""
+    wires = {"stack.displacement": "flexure.tip_position", "stack.velocity": "flexure.tip_velocity"}
+    return psa.System(
+        name="pushed_stage",
+        parts={"stack": model_named(STACK).plant(), "flexure": model_named("flexure")},
+        wires=(*wires.items(), ("flexure.reaction_force", "stack.load_force")),
+        inputs={"command": "stack.voltage"},
+        outputs={"stage_position": "flexure.stage_position", "tip": "stack.displacement"},
+    )
+
+
+@cache
+def closed_loop() -> psa.System:
+    return psa.nanopositioner(STACK)
+
+
+@cache
+def archive_of(name: str) -> Path:
+    system = pushed_stage() if name == "pushed_stage" else closed_loop()
+    return psa.export_ssp(system, Path(_FOLDER.name) / f"{name}.ssp")
+
+
+@cache
+def monolithic() -> tuple[FloatArray, FloatArray]:
+    """Return the final displacements of stack and stage, from one set of equations."""
+    stack, flexure = model_named(STACK).plant(), model_named("flexure")
+    f, g = stack.structure.f, flexure.structure.f
+    p, q = stack.parameter_vector(), flexure.parameter_vector()
+    count = len(stack.state_names)
+    at = [stack.output_names.index(name) for name in ("displacement", "velocity")]
+
+    def rates(t: float, z: FloatArray) -> FloatArray:
+        tip = np.array(f(t, z[:count], [RATE * t, 0.0], p)[1]).ravel()[at]
+        slope, out = g(t, z[count:], tip, q)
+        force = float(out[flexure.output_names.index("reaction_force")])
+        slopes = f(t, z[:count], [RATE * t, force], p)[0]
+        return np.concatenate([np.array(slopes).ravel(), np.array(slope).ravel()])
+
+    size = np.concatenate([stack.state_nominals(), flexure.state_nominals()])
+    solution = solve_ivp(
+        rates, (0.0, END), np.zeros(len(size)), method="LSODA", rtol=1e-9, atol=1e-11 * size
+    )
+    assert solution.success
+    final = solution.y[:, -1]
+    return final[stack.state_names.index("x")], final[count]

@@ -1,17 +1,26 @@
-"""FMUs of other tools, made here: PythonFMU (FMI 2) and PythonFMU3 (FMI 3), co-simulation only."""
+"""FMUs of other tools, made here: by PythonFMU (FMI 2) and PythonFMU3 (FMI 3), and of C files.
+
+Those of PythonFMU have co-simulation only.
+"""
 
 import tempfile
+import zipfile
 from functools import cache
+from importlib.resources import files
 from pathlib import Path
 
 import casadi as ca
+import fmpy
 import numpy as np
+from fmpy.fmi2 import FMU2Model
 from pythonfmu.builder import FmuBuilder as Builder2
 from pythonfmu3.builder import FmuBuilder as Builder3
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
+from psa_casadi.common.files import temporary_folder
 from psa_casadi.common.units import FloatArray
+from psa_casadi.simulation.compiler import compiler_command, run_compiler
 
 _FOLDER = tempfile.TemporaryDirectory()
 _SUPPLIERS = Path(__file__).with_name("suppliers")
@@ -25,6 +34,40 @@ def supplied(name: str) -> Path:
     build = (Builder2 if name == "tank" else Builder3).build_FMU
     made: Path = build(_SUPPLIERS / f"{name}.py", dest=_FOLDER.name)
     return made
+
+
+@cache
+def _library(source: Path, *flags: str, stubs: bool) -> bytes:
+    code = source.read_text("utf-8")
+    lacking = [n for n in dir(FMU2Model) if n.startswith("fmi2") and f" {n}(" not in code]
+    refusals = "".join(f"int {name}(void) {{ return 3; }}\n" for name in lacking if stubs)
+    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{files('fmpy') / 'c-code'}"]
+    with temporary_folder() as folder:
+        (folder / "model.c").write_text(code, encoding="utf-8")
+        (folder / "stubs.c").write_text(refusals, encoding="utf-8")
+        run_compiler([*command, *flags, "model.c", "stubs.c", "-lm", "-o", "library"], folder)
+        return (folder / "library").read_bytes()
+
+
+def compiled_fmu(name: str, *flags: str, stubs: bool = False, **words: object) -> Path:
+    """Return the FMU of a C file, and of the description in its folder with some words put in.
+
+    With `stubs` the functions of model exchange that the file lacks return an error.
+    """
+    source = Path(__file__).parent / name
+    path = Path(tempfile.mkdtemp(dir=_FOLDER.name)) / f"{source.stem}.fmu"
+    description = source.with_name("modelDescription.xml").read_text("utf-8").format(**words)
+    place = f"binaries/{fmpy.platform}/{source.stem}{fmpy.sharedLibraryExtension}"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", description)
+        archive.writestr(place, _library(source, *flags, stubs=stubs))
+    return path
+
+
+@cache
+def pendulum(*, indicators: int = 0, once: str = "false") -> Path:
+    """Return the FMU of a pendulum, which has model exchange only."""
+    return compiled_fmu("pendulum/pendulum.c", stubs=True, indicators=indicators, once=once)
 
 
 def level(area: float, outlet: float, flow: FloatArray = INFLOW) -> FloatArray:

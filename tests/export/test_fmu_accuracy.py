@@ -53,9 +53,8 @@ SIGNALS: dict[str, tuple[FloatArray, Any]] = {
 def _signals(name: str, kind: str) -> Signals:
     times, shares = SIGNALS[kind]
     voltage = model_named(name).values["u_rated"] * shares
-    return Signals(
-        ("voltage", "load_force"), times, np.column_stack([voltage, 0.0 * voltage])
-    )  # fmt: skip
+    columns = np.column_stack([voltage, 0.0 * voltage])
+    return Signals(("voltage", "load_force"), times, columns)
 
 
 @cache

@@ -30,7 +30,7 @@ from psa_casadi.export.importer.fmu import (
     Instance,
 )
 from tests.export.c_host.build import HERE
-from tests.export.fmi3_instances import Instance3, Update, loaded, try_step
+from tests.export.fmi3_instances import Instance3, Update, loaded, restore, saved, try_step
 from tests.export.fmu_models import exported, model_named, recompiled
 from tests.tiers import slow
 
@@ -240,7 +240,7 @@ def test_intermediate_updates_follow_the_solver_and_change_nothing(slave: Instan
         path = [d for _, d in updates]
         assert 0.0 < path[0] < path[-1]
         assert slave.get(OUTPUTS).tobytes() == watched.get(OUTPUTS).tobytes()
-        assert slave.serialized() == watched.serialized()
+        assert saved(slave) == saved(watched)
 
 
 @pytest.mark.parametrize("late", [0.0, 1e-4])
@@ -330,11 +330,11 @@ def _play(slave: Instance3, first: int, last: int) -> bytes:
 def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Instance3) -> None:
     """Two instances at different addresses write the same bytes; time is at its place."""
     _play(slave, 0, 7)
-    data = slave.serialized()
+    data = saved(slave)
     with Instance3(slave.fmu) as other:
         other.start()
         _play(other, 0, 7)
-        assert other.serialized() == data
+        assert saved(other) == data
     assert data[:8] == b"psasnap\0"
     assert (len(data) - 32) % 8 == 0
     assert struct.unpack("<I", data[12:16])[0] == len(data) - 32
@@ -345,12 +345,13 @@ def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Insta
         (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], reason) for k, reason in flips.items()
     ]
     for wrong, reason in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
-        assert slave.try_restore(wrong) == ERROR
-        assert reason in slave.messages[-1]
-    with Instance3(slave.fmu, MODEL_EXCHANGE) as exchange:
-        assert exchange.try_restore(data) == ERROR
-        assert "other interface" in exchange.messages[-1]
-    assert slave.serialized() == data
+        with pytest.raises(FmuError, match=reason) as refusal:
+            restore(slave, wrong)
+        assert refusal.value.status == ERROR
+    exchange = Instance3(slave.fmu, MODEL_EXCHANGE)
+    with exchange, pytest.raises(FmuError, match="other interface"):
+        restore(exchange, data)
+    assert saved(slave) == data
 
 
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -379,16 +380,6 @@ def _forged(data: bytes, word: int, content: bytes) -> bytes:
     return data[: STAMP - 8] + struct.pack("<Q", checksum) + bytes(state)
 
 
-def _saved(instance: Instance, moved: str) -> bytes:
-    """Return the state after a step, as bytes."""
-    instance.set({moved: 5.0})
-    instance.step(0.0, 1e-3)
-    snapshot = instance.fmi.getFMUState()
-    data: bytes = instance.fmi.serializeFMUState(snapshot)
-    instance.fmi.freeFMUState(snapshot)
-    return data
-
-
 def _use(instance: Instance, moved: str) -> str:
     """Set, step, differentiate and read an instance; return its message if it refuses."""
     state = instance.fmu.states()[0]
@@ -411,23 +402,21 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
     refused: dict[tuple[int, bytes], int] = {}
     refusals, slowest = set(), 0.0
     with Fmu(path) as fmu, fmu.start(CO_SIMULATION) as instance:
-        data = _saved(instance, moved)
+        instance.set({moved: 5.0})
+        instance.step(0.0, 1e-3)
+        data = saved(instance)
         assert _forged(data, 0, data[STAMP : STAMP + 8]) == data
         for word in range((len(data) - STAMP) // 8):
             for content in WORDS:
                 begin = time.monotonic()
                 try:
-                    snapshot = instance.fmi.deserializeFMUState(_forged(data, word, content))
+                    restore(instance, _forged(data, word, content))
                 except FmuError as refusal:
                     refused[word, content] = refusal.status
                     continue
-                instance.fmi.setFMUState(snapshot)
-                instance.fmi.freeFMUState(snapshot)
                 refusals.add(_use(instance, moved))
                 slowest = max(slowest, time.monotonic() - begin)
-        snapshot = instance.fmi.deserializeFMUState(data)
-        instance.fmi.setFMUState(snapshot)
-        instance.fmi.freeFMUState(snapshot)
+        restore(instance, data)
         instance.step(1e-3, 1e-3)
     states = range(3, 3 + len(fmu.states()))
     assert {(w, c) for w in states for c in (WORDS[0], WORDS[3])} <= set(refused)
@@ -439,7 +428,7 @@ def test_forged_snapshots_do_no_harm(model: str) -> None:
 def test_a_forged_parameter_is_named(either: Instance) -> None:
     kept = 0.0123456789
     either.set({"m_B": kept})
-    data = _saved(either, "voltage")
+    data = saved(either)
     place = data.index(struct.pack("<d", kept), STAMP) - STAMP
     with pytest.raises(FmuError, match="altered: m_B cannot be"):
         either.fmi.deserializeFMUState(_forged(data, place // 8, struct.pack("<d", -kept)))
@@ -449,12 +438,9 @@ def test_a_snapshot_that_frees_itself(either: Instance) -> None:
     """Some importers pass the snapshot in the place of its address; reference FMUs bear it."""
     snapshot = either.fmi.getFMUState()
     word = "FMUstate" if either.fmu.version == 2 else "FMUState"
-    assert (
-        getattr(either.fmu.library, f"fmi{either.fmu.version}Free{word}")(
-            either.fmi.component, ctypes.cast(snapshot, ctypes.POINTER(ctypes.c_void_p))
-        )
-        == OK
-    )
+    free = getattr(either.fmu.library, f"fmi{either.fmu.version}Free{word}")
+    place = ctypes.cast(snapshot, ctypes.POINTER(ctypes.c_void_p))
+    assert free(either.fmi.component, place) == OK
     either.set({"voltage": 20.0})
     either.step(0.0, 1e-3)
     either.fmi.setFMUState(snapshot)  # nothing was freed, nothing written

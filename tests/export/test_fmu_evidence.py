@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.export.check.agreement import Playback, played_again
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
-from psa_casadi.export.check.measured import Playback, played_again
 from psa_casadi.export.check.rows import CheckRow
 from psa_casadi.export.fmu import evidence
 from psa_casadi.export.fmu.evidence import seen_inputs, with_validity
@@ -23,9 +23,9 @@ from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION, Fmu
 from psa_casadi.export.importer.masters import Signals, communicate
 from psa_casadi.identification.determinacy import determinacy
-from psa_casadi.identification.evidence import evidence_of
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.prepare import prepared
+from psa_casadi.identification.result import evidence_of
 from psa_casadi.model.components.outputs import OUTPUT
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import loads
@@ -55,9 +55,8 @@ def test_experiments_name_files_that_are_there() -> None:
     for name in (n for n in table if n.endswith(".ssv")):
         assert_valid(table[name].decode(), "ssp", "schema", "SystemStructureParameterValues.xsd")
         root = ET.fromstring(table[name])
-        output = {
-            p.get("name"): p[0].get("unit") for p in root.iterfind("{*}Parameters/{*}Parameter")
-        }
+        listed = root.iterfind("{*}Parameters/{*}Parameter")
+        output = {p.get("name"): p[0].get("unit") for p in listed}
         assert {*output.values()} <= {u.get("name") for u in root.iterfind("{*}Units/{*}Unit")}
         units = {p.name: p.unit for p in evident_model().structure.parameters if p.name in output}
         assert units.items() <= output.items()
@@ -66,7 +65,7 @@ def test_experiments_name_files_that_are_there() -> None:
     assert re.findall(r'Parameter name="(\w+)"', one) == ["k_L", "A", "tau"]
 
 
-def test_meta_data_and_page_say_the_same() -> None:
+def test_meta_data_and_page_state_the_same() -> None:
     """Names and order as the schema of SSP Traceability 1.0 has them (SRMD.xsd, STC.xsd)."""
     table = files_inside(evident_fmu())
     root = ET.fromstring(table[evidence.META_DATA])
@@ -102,7 +101,7 @@ def test_a_model_without_evidence_has_no_such_files() -> None:
     assert evidence.UNCERTAINTY not in none
 
 
-def test_what_a_person_says_of_a_record_stays_text() -> None:
+def test_names_of_records_stay_text() -> None:
     """A record's name may hold what means something in HTML and XML."""
     model, output = evident_model().plant(), stated()
     assert output.reference is not None
@@ -120,7 +119,7 @@ def test_what_a_person_says_of_a_record_stays_text() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) -> None:
+def test_the_command_writes_sets_and_lists_the_files_inside(tmp_path: Path) -> None:
     psa.save_model(evident_model(), tmp_path / "m.json")
     path, sets = tmp_path / "m.fmu", tmp_path / "sets"
     line = f"export fmu --model {tmp_path / 'm.json'} -o {path} --include-sensor"
@@ -137,9 +136,6 @@ def test_the_command_writes_sets_and_tells_what_is_files_inside(tmp_path: Path) 
         assert played_again(fmu, playback).figure < 1e-4
 
 
-_SAID = "From here on the results are extrapolated."
-
-
 def messages(
     fmi: int, peak: float, duration: float, *, start: float = 0.0, steps: int = 100
 ) -> tuple[list[str], np.ndarray]:
@@ -149,20 +145,20 @@ def messages(
     inputs = Signals(("voltage",), times, volts[:, None])
     with Fmu(evident_fmu(fmi)) as fmu, fmu.start(CO_SIMULATION, start_time=start) as instance:
         values = communicate(instance, times, inputs, [OUTPUT])
-        return [m for m in instance.messages if _SAID in m], values[:, 0]
+        extrapolated = "From here on the results are extrapolated."
+        return [m for m in instance.messages if extrapolated in m], values[:, 0]
 
 
 @pytest.mark.parametrize("fmi", slow_but([2], [2, 3]))
-def test_inside_nothing_is_said(fmi: int) -> None:
+def test_inside_nothing_is_logged(fmi: int) -> None:
     logged, outside = messages(fmi, 75.0, 0.5, start=1e3)
     assert logged == []
     assert np.all(outside == 0.0)
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
-def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
-    logged, outside = messages(fmi, 120.0, 0.6)
-    (line,) = logged
+def test_leaving_the_voltage_is_logged_once(fmi: int) -> None:
+    (line,), outside = messages(fmi, 120.0, 0.6)
     assert line.startswith("voltage is 7")
     low, high = stated().seen.voltage.low, stated().seen.voltage.high
     assert f"from {low:.6g} to {high:.6g}." in line
@@ -173,14 +169,12 @@ def test_leaving_the_voltage_is_said_once(fmi: int) -> None:
 
 @slow
 @pytest.mark.parametrize("fmi", slow_but([3], [2, 3]))
-def test_a_rate_and_a_time_that_no_record_has_are_said(fmi: int) -> None:
-    logged, outside = messages(fmi, 75.0, 0.01)
-    assert len(logged) == 1
-    assert logged[0].startswith("The rate per second of voltage is 1")
+def test_a_rate_and_a_time_that_no_record_has_are_logged(fmi: int) -> None:
+    (line,), outside = messages(fmi, 75.0, 0.01)
+    assert line.startswith("The rate per second of voltage is 1")
     assert np.max(outside) > 1.0
-    logged, outside = messages(fmi, 75.0, 0.8)
-    assert len(logged) == 1
-    assert logged[0].startswith("The time since the start is 0.64")
+    (line,), outside = messages(fmi, 75.0, 0.8)
+    assert line.startswith("The time since the start is 0.64")
     assert np.all(outside == 0.0)
 
 
@@ -230,18 +224,17 @@ def test_a_record_that_was_averaged_is_averaged_again() -> None:
     assert shorter.n < record.n
     result = fit(psa.stack_model("demo"), (whole(shorter),), ["k_L"], sigma=[1e-7])
     output = evidence_of(
-        result, determinacy(result, (whole(shorter),)), (whole(shorter),),
-        result.predicted((whole(shorter),)), by="test", sampled=[record],
-    )  # fmt: skip
+        result, determinacy(result), result.predicted(), by="test", sampled=[record]
+    )
     model = replace(result.model.plant(), evidence=replace(output, reference=None))
     with Archive(evident_fmu()) as archive:
         again = repeated(archive, model, [record])
         gone = repeated(archive, model, [record.slice(0, 7000)])
     (playback,) = (run for run in again if isinstance(run, Playback))
-    assert len(playback.times) == shorter.n
+    assert len(playback.inputs.times) == shorter.n
     x0 = np.array([playback.start[n] for n in model.state_names])
     inputs = np.column_stack([playback.inputs.values[:, 0], np.zeros(shorter.n)])
-    y = psa.run(model, playback.times, inputs, x0, rtol=1e-9).y
+    y = psa.run(model, playback.inputs.times, inputs, x0, rtol=1e-9).y
     error = playback.expected - y[:, model.output_names.index("displacement")]
     assert np.sqrt(np.mean(error**2)) == pytest.approx(playback.stated, rel=1e-4)
     refused = gone[-1]
@@ -259,7 +252,7 @@ def test_another_record_is_not_one_of_those() -> None:
     assert not any("error of" in r.name for r in rows)
 
 
-def test_an_error_that_is_stated_too_small_is_found(tmp_path: Path) -> None:
+def test_an_error_that_is_stated_too_small_is_detected(tmp_path: Path) -> None:
     def smaller(content: bytes) -> bytes:
         return re.sub(rb'("held_out_m": )[\d.e+-]+', rb"\g<1>1.5e-08", content)
 
@@ -270,7 +263,7 @@ def test_an_error_that_is_stated_too_small_is_found(tmp_path: Path) -> None:
 
 
 @slow
-def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
+def test_another_run_and_other_files_are_detected(tmp_path: Path) -> None:
     def moved(content: bytes) -> bytes:
         lines = content.decode().splitlines()
         column = lines[0].split(",").index("displacement")
@@ -283,12 +276,10 @@ def test_another_run_and_other_files_are_found(tmp_path: Path) -> None:
         evidence.PAGE: lambda c: c.replace(b"held-out", b"hold-out"),
     }
     path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
-    with Archive(path) as archive:
-        assert list(wrong_evidence(archive, carried(path))) == [
-            f"{evidence.PAGE} is not what the model says"
-        ]
-    with Archive(evident_fmu()) as archive:
-        assert list(wrong_evidence(archive, carried(path))) == []
+    wrong = [f"{evidence.PAGE} is not what the model says"]
+    for fmu, problems in ((path, wrong), (evident_fmu(), [])):
+        with Archive(fmu) as archive:
+            assert list(wrong_evidence(archive, carried(path))) == problems
     (row,) = play(path)
     assert row.name == "reference run"
     assert not row.passed
@@ -306,7 +297,7 @@ def test_errors_that_count_with_a_sensor_are_not_those_of_the_plant() -> None:
 
 
 @pytest.mark.slow
-def test_an_fmu_without_evidence_does_not_pass_when_it_is_asked_for() -> None:
+def test_an_fmu_without_evidence_does_not_pass_when_it_is_requested() -> None:
     """Without `evidence` it passes: tests/export/test_fmu.py."""
     report = psa.check_fmu(exported("P-885.51"), evidence=True)
     assert [r.name for r in report.failures] == ["evidence"]

@@ -21,16 +21,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import psa_casadi as psa
 from psa_casadi.common.children import heard
-from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import temporary_folder
 from psa_casadi.export.check import apart
 from psa_casadi.export.check.binaries import FUNCTIONS
-from psa_casadi.export.check.check import CheckRow, check_fmu
+from psa_casadi.export.check.check import CheckRow
 from psa_casadi.export.importer import archive as limits
 from psa_casadi.export.importer.archive import Archive, archive_problems
 from psa_casadi.simulation.compiler import OPTIMISE, compiler_command, run_compiler
 from tests.contract.helpers import command
+from tests.export.fmu_models import rewritten
 from tests.export.ssp_master import SspArchive
 from tests.test_files import ended
 from tests.tiers import slow, slow_but
@@ -99,7 +100,7 @@ QUICK = [(2, "load", "exit"), (2, "make", "exit"), (3, "step", "exit"), (2, "ste
 
 
 @pytest.fixture(autouse=True)
-def _own_temporary_folder(
+def _temporary_folder(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("temporary")))
@@ -111,7 +112,7 @@ def _ended(
     """Return the last row, and the names of the rows before it; nothing may be left over."""
     monkeypatch.setenv(DEED, deed)
     path = hostile_fmu(tmp_path / "h.fmu", fmi)
-    report = check_fmu(path, **{"timeout": 60.0, **limits})
+    report = psa.check_fmu(path, **{"timeout": 60.0, **limits})
     assert list(Path(tempfile.gettempdir()).iterdir()) == []
     assert not report.passed
     return report.rows[-1], [row.name for row in report.rows[:-1]]
@@ -120,7 +121,7 @@ def _ended(
 @pytest.mark.parametrize(
     ("fmi", "moment", "deed"), slow_but(QUICK, dict.fromkeys((*QUICK, *CASES)))
 )
-def test_every_way_to_end_is_told_apart(
+def test_every_way_to_end_has_its_remark(
     fmi: int, moment: str, deed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row, before = _ended(tmp_path, fmi, f"{moment}:{deed}", monkeypatch)
@@ -130,7 +131,7 @@ def test_every_way_to_end_is_told_apart(
     assert ("instances" in before) == (moment == "step")
 
 
-def test_the_command_fails_and_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_fails_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It ended with exit code 0, and without a word."""
     monkeypatch.setenv(DEED, "load:exit")
     path = hostile_fmu(tmp_path / "h.fmu", 2)
@@ -172,10 +173,8 @@ def test_a_hang_ends_at_the_time_limit(
     row, _ = _ended(tmp_path, 2, f"{moment}:hang", monkeypatch, timeout=40.0)
     assert 0.0 < limits[0] <= 40.0
     assert row.name == DURING[moment]
-    assert (
-        "did not come back within the time limit of 40 s of the whole check (--timeout sets it)"
-        in row.remark
-    )
+    text = "did not come back within the time limit of 40 s of the whole check (--timeout sets it)"
+    assert text in row.remark
     assert ended(int(place.read_text()))
 
 
@@ -202,9 +201,9 @@ def test_what_is_printed_is_no_result_and_no_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = hostile_fmu(tmp_path / "h.fmu", 2)
-    quiet = [(row.name, row.passed) for row in check_fmu(path).rows]
+    quiet = [(row.name, row.passed) for row in psa.check_fmu(path).rows]
     monkeypatch.setenv(DEED, "load:print")
-    assert [(row.name, row.passed) for row in check_fmu(path).rows] == quiet
+    assert [(row.name, row.passed) for row in psa.check_fmu(path).rows] == quiet
     assert capfd.readouterr() == ("", "")
 
 
@@ -282,20 +281,26 @@ def test_such_an_archive_is_neither_unpacked_nor_run(
     assert not any(archive_problems(path).values())
     with zipfile.ZipFile(path, "a") as archive:
         change(archive)
-    report = check_fmu(path)
+    report = psa.check_fmu(path)
     row = "archive names" if what in NAMES else "archive size"
     assert [(r.name, remark in r.remark) for r in report.failures] == [(row, True)]
     assert all(r.name.startswith("archive") for r in report.rows)
     assert all(r.remark.isprintable() for r in report.rows)
     for reader in (Archive, SspArchive):
-        with pytest.raises(InputError, match=r"h\.fmu"):
+        with pytest.raises(psa.InputError, match=r"h\.fmu"):
             reader(path)
     assert [p.name for p in tmp_path.iterdir()] == ["h.fmu"]
 
 
-def test_sizes_of_all_entries_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entries_and_a_description_beyond_their_limits_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = _archive(tmp_path / "h.fmu")
+    monkeypatch.setattr(limits, "LONGEST_TEXT", 100)
+    with pytest.raises(psa.InputError, match=r"modelDescription\.xml has more than"):
+        Archive(path)
     monkeypatch.setattr(limits, "MOST_BYTES", 100)
-    (problem,) = archive_problems(_archive(tmp_path / "h.fmu"))["archive size"]
+    (problem,) = archive_problems(path)["archive size"]
     assert "more than 100" in problem
 
 
@@ -322,32 +327,22 @@ def _damaged(path: Path, how: str) -> None:
 def test_damage(how: str, row: str, match: str, tmp_path: Path) -> None:
     path = _archive(tmp_path / "h.fmu")
     _damaged(path, how)
-    report = check_fmu(path)
+    report = psa.check_fmu(path)
     assert [(r.name, match in r.remark) for r in report.failures] == [(row, True)], report.rows
     assert len(report.rows) == 3
 
 
 def test_a_description_that_names_a_library_elsewhere(tmp_path: Path) -> None:
-    path = tmp_path / "h.fmu"
-    with zipfile.ZipFile(_archive(tmp_path / "good.fmu")) as good:
-        text = good.read("modelDescription.xml").replace(b'Identifier="h"', b'Identifier="../../h"')
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", text)
-    with pytest.raises(InputError, match="is no name in C"):
+    path = _archive(tmp_path / "h.fmu")
+    outside = (b'Identifier="h"', b'Identifier="../../h"')
+    rewritten(path, path, {"modelDescription.xml": lambda text: text.replace(*outside)})
+    with pytest.raises(psa.InputError, match="is no name in C"):
         Archive(path)
-
-
-def test_a_description_that_would_fill_the_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(limits, "LONGEST_TEXT", 100)
-    with pytest.raises(InputError, match=r"modelDescription\.xml has more than"):
-        Archive(_archive(tmp_path / "h.fmu"))
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.data())
-def test_any_change_of_bytes_is_told_or_harmless(
+def test_any_change_of_bytes_is_reported_or_harmless(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     path = tmp_path_factory.mktemp("scratch") / "a.zip"

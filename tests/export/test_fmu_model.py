@@ -2,60 +2,20 @@
 
 import hashlib
 import json
-import tempfile
-import zipfile
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
 import casadi as ca
-import fmpy
 import numpy as np
 import pytest
-from fmpy.fmi2 import FMU2Model
 from scipy.integrate import solve_ivp
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.model.ports import ports_of, with_ports
-from psa_casadi.simulation.compiler import compiler_command, run_compiler
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import start_state
-
-_FOLDER = tempfile.TemporaryDirectory()
-_SOURCES = Path(__file__).parent / "pendulum"
-
-
-@cache
-def pendulum(*, indicators: int = 0, once: str = "false") -> Path:
-    """Return the FMU of the pendulum, with other words in its description."""
-    folder = Path(_FOLDER.name) / f"{indicators}{once}"
-    folder.mkdir()
-    path = folder / "pendulum.fmu"
-    with zipfile.ZipFile(path, "w") as archive:
-        text = (_SOURCES / "modelDescription.xml").read_text("utf-8")
-        text = text.format(indicators=indicators, once=once)
-        archive.writestr("modelDescription.xml", text)
-        place = f"binaries/{fmpy.platform}/pendulum{fmpy.sharedLibraryExtension}"
-        archive.write(_binary(), place)
-    return path
-
-
-@cache
-def _binary() -> Path:
-    folder = Path(_FOLDER.name)
-    code = (_SOURCES / "pendulum.c").read_text("utf-8")
-    (folder / "pendulum.c").write_text(code, encoding="utf-8")
-    # further ones of the standard, which importers look up
-    names = [n for n in dir(FMU2Model) if n[:4] == "fmi2" and f" {n}(" not in code]
-    refused = "".join(f"int {name}(void) {{ return 3; }}\n" for name in names)
-    (folder / "refused.c").write_text(refused, encoding="utf-8")
-    library = folder / f"pendulum{fmpy.sharedLibraryExtension}"
-    headers = files("fmpy") / "c-code"
-    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{headers}"]
-    run_compiler([*command, "pendulum.c", "refused.c", "-lm", "-o", str(library)], folder)
-    return library
-
+from tests.export.supplied import pendulum
 
 FREE = {"length": (0.1, 5.0), "damping": (1e-3, 1.0)}
 TRUE = {"length": 0.62, "damping": 0.11}
@@ -146,10 +106,10 @@ def test_a_torque_that_goes_no_further_is_named() -> None:
 def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
     x, u, k = (ca.SX.sym(n) for n in ("x", "voltage", "k"))
     k_ = psa.Parameter("k", 3.0, "1/s", (0.1, 30.0), "rate", log=True)
-    own = psa.ode_model(
+    cubic = psa.ode_model(
         {"x": x, "u": u, "p": k, "ode": k * (u - x**3), "y": x + u}, name="cubic", parameters=[k_]
     )
-    path = psa.export_fmu(own, tmp_path / "cubic.fmu", fmi=3)
+    path = psa.export_fmu(cubic, tmp_path / "cubic.fmu", fmi=3)
     there = psa.fmu_model(path, free=["k"])
     u_: FloatArray = np.sin(np.arange(300) * 0.1)[:, None]
 
@@ -157,9 +117,9 @@ def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
         steps = psa.run(model, 4 * T[:300], u_, np.zeros(1), unknowns=["k"], outputs=["y"])
         return np.hstack([steps.y, steps.sensitivity[:, 0]])
 
-    assert run(there) == pytest.approx(run(own), rel=1e-6, abs=1e-7)
+    assert run(there) == pytest.approx(run(cubic), rel=1e-6, abs=1e-7)
     simulated = psa.simulate(there, 4 * T[:300], u_[:, 0], rtol=1e-7)
-    assert simulated.outputs["y"] == pytest.approx(run(own)[:, 0], rel=1e-6, abs=1e-6)
+    assert simulated.outputs["y"] == pytest.approx(run(cubic)[:, 0], rel=1e-6, abs=1e-6)
     with pytest.raises(psa.InputError, match="can only begin at its start values"):
         start_state(there, [0.0])
     values = [{"k": v} for v in np.linspace(1.0, 9.0, 40)]

@@ -351,7 +351,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_found(fault: str, tmp_path: Path) -> None:
+def test_faults_are_reported(fault: str, tmp_path: Path) -> None:
     """Each guard reports a fault of its kind that is put into the sources."""
     kind, word, file, old, new = FAULTS[fault]
     inside = tmp_path / "sources"

@@ -1,7 +1,6 @@
 """FMUs that are run as a whole: co-simulation only, events, arrays; effects around them."""
 
 import re
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -10,25 +9,22 @@ import casadi as ca
 import fmpy
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
 from psa_casadi.common.children import end_children
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.generic.attached import extended
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.fmu_model import FmuInterface
-from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.importer.play import Run, communication_points, stepped
+from psa_casadi.export.importer.masters import Run, Signals, communication_points, stepped
 from psa_casadi.export.importer.played import RUNS
 from psa_casadi.simulation.sizes import Sizes
 from psa_casadi.simulation.start import start_for
 from psa_casadi.simulation.stepper import SimulationError
+from tests.contract.helpers import done, refused, samples, write
+from tests.export.fmu_models import files_inside, rewritten
 from tests.export.ssp_master import SspArchive, couple
-from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, supplied
-from tests.export.test_fmu_model import pendulum
+from tests.export.supplied import INFLOW, TIMES, bounces, lagged, level, pendulum, supplied
 
 T = np.linspace(0.0, 20.0, 401)
 U = np.column_stack([np.sin(T) + 0.4 * np.sin(3.1 * T)])
@@ -43,13 +39,11 @@ def _processes() -> Iterator[None]:
     RUNS.end()
 
 
-def _own() -> psa.Model:
+def _first_order(rate: float = 1.3) -> psa.Model:
     x, u, k = (ca.SX.sym(n) for n in ("x", "u", "k"))
-    k_ = psa.Parameter("k", 1.3, "1/s", (0.1, 30.0), "rate", log=True)
-    return psa.ode_model(
-        {"x": x, "u": u, "p": k, "ode": k * (u - x), "y": x}, name="own", parameters=[k_],
-        outputs=["y"],
-    )  # fmt: skip
+    k_ = psa.Parameter("k", rate, "1/s", (0.1, 400.0), "rate", log=True)
+    ode = {"x": x, "u": u, "p": k, "ode": k * (u - x), "y": x}
+    return psa.ode_model(ode, name="first_order", parameters=[k_], outputs=["y"])
 
 
 def _record(area: float, outlet: float, y: FloatArray | None = None) -> dict[str, FloatArray]:
@@ -65,13 +59,13 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
         "k": 1.7, "lag_of_u_time": 0.3, "bend_of_u_size": 0.2, "lag_of_y_time": 0.4,
         "gain_of_y_size": 0.1, "delay_of_y_time": 0.2,
     }  # fmt: skip
-    own = _own()
+    symbolic = _first_order()
     whole = psa.fmu_model(
-        psa.export_fmu(own, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
+        psa.export_fmu(symbolic, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
     )
     table = {e.name: e for e in effects_of(whole, ALL)}
     items = []
-    for base in (own, whole):
+    for base in (symbolic, whole):
         model = extended(base, [table[n] for n in names]).with_values(values)
         free = ["k", *(n for n in values if n != "k")]
         start = start_for(model, T, U, {})
@@ -87,10 +81,9 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
 def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
     model = psa.fmu_model(supplied("tank"), free=AREA, values={"valve": 1.0})
     y = psa.run(model, TIMES, INFLOW[:, None], np.zeros(0)).y[:, 0]
-    rows = list(zip(TIMES, INFLOW, strict=True))
     peer = fmpy.simulate_fmu(
         str(supplied("tank")), stop_time=100.0, output_interval=0.2, start_values={"valve": True},
-        input=np.array(rows, dtype=[("time", float), ("inflow", float)]), output=["level"],
+        input=samples(time=TIMES, inflow=INFLOW), output=["level"],
         validate=False,
     )["level"]  # fmt: skip
     truth = level(0.5, 0.01)
@@ -100,23 +93,16 @@ def test_a_run_is_nearer_to_the_truth_than_an_importer_s() -> None:
 
 
 def test_a_step_is_divided_where_the_fmu_is_fast(tmp_path: Path) -> None:
-    x, u, k = (ca.SX.sym(n) for n in ("x", "u", "k"))
-    k_ = psa.Parameter("k", 40.0, "1/s", (1.0, 400.0), "rate", log=True)
-    ode = {"x": x, "u": u, "p": k, "ode": k * (u - x), "y": x}
-    fast = psa.ode_model(ode, name="fast", parameters=[k_], outputs=["y"])
-    path = tmp_path / "one_step.fmu"  # FMI 3: no input derivatives
-    with (
-        zipfile.ZipFile(psa.export_fmu(fast, tmp_path / "fast.fmu", fmi=3)) as old,
-        zipfile.ZipFile(path, "w") as new,
-    ):
-        for entry in old.infolist():
-            new.writestr(entry, re.sub(rb' stepSize="[^"]*"', b"", old.read(entry)))
+    fast = _first_order(40.0)
+    path = psa.export_fmu(fast, tmp_path / "fast.fmu", fmi=3)  # without input derivatives
+    unstated = {"modelDescription.xml": lambda xml: re.sub(rb' stepSize="[^"]*"', b"", xml)}
+    rewritten(path, path, unstated)
     exact = psa.run(fast, T[::4], U[::4], np.zeros(1), rtol=1e-9).y
     there = psa.fmu_model(path, free=["k"], interface="co-simulation")
     played = psa.run(there, T[::4], U[::4], np.zeros(0)).y
     assert np.std(played - exact) < 1e-3 * np.std(exact)
     table = {"k": 40.0}
-    run = Run(str(path), "", 1, ("u",), ("y",), table, T[::4], U[::4], "linear")
+    run = Run(str(path), "", 1, ("y",), table, Signals(("u",), T[::4], U[::4]))
     with Fmu(path) as fmu:
         assert np.std(stepped(fmu, run) - exact) > 3e-3 * np.std(exact)
 
@@ -174,6 +160,17 @@ def test_events_of_model_exchange_are_those_of_its_solver(tmp_path: Path) -> Non
         assert result.sensitivity == pytest.approx(exact.sensitivity, abs=most)
 
 
+def test_inputs_move_while_the_solver_takes_a_step(tmp_path: Path) -> None:
+    """One with event indicators is not taken for one whose importer holds the inputs."""
+    stack, time = psa.stack_model("P-885.51"), np.linspace(0.0, 0.1, 101)
+    voltage = 50.0 - 50.0 * np.cos(40.0 * np.pi * time)
+    there = psa.fmu_model(psa.export_fmu(stack, tmp_path / "stack.fmu"), interface="model exchange")
+    u = np.array([voltage if n == "voltage" else 0.0 * voltage for n in there.input_names]).T
+    y = psa.run(there, time, u, np.zeros(0)).y[:, there.output_names.index("displacement")]
+    exact = psa.simulate(stack, time, voltage).displacement
+    assert y == pytest.approx(exact, abs=1e-3 * np.ptp(exact))
+
+
 def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:
     with pytest.raises(psa.InputError, match=r"has no co-simulation, only 'model exchange'"):
         psa.fmu_model(pendulum(once="true"), interface="co-simulation")
@@ -185,7 +182,7 @@ def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:
 
 
 def test_communication_points_are_what_the_fmu_takes(tmp_path: Path) -> None:
-    path = psa.export_fmu(_own(), tmp_path / "own.fmu")
+    path = psa.export_fmu(_first_order(), tmp_path / "own.fmu")
     uneven = np.array([0.0, 0.1, 0.25, 0.3])
     with Fmu(path) as fmu:
         co = fmu.description.coSimulation
@@ -201,7 +198,7 @@ def test_communication_points_are_what_the_fmu_takes(tmp_path: Path) -> None:
         assert np.diff(points) == pytest.approx(0.08)
 
 
-def test_a_model_says_what_it_lacks() -> None:
+def test_a_model_names_what_it_lacks() -> None:
     tank = supplied("tank")
     with pytest.raises(psa.InputError, match=r"area \(0\.5\), outlet \(0\.01\)\. .*area=0\.05:5\."):
         psa.fmu_model(tank)
@@ -217,33 +214,24 @@ def test_a_model_says_what_it_lacks() -> None:
 
 
 def test_the_commands_take_it_and_write_start_values(tmp_path: Path) -> None:
-    table = np.column_stack(list(_record(0.7, 0.01).values()))
-    record = tmp_path / "tank.csv"
-    np.savetxt(record, table, delimiter=",", header="time,inflow,level", comments="")
+    record = write(tmp_path / "tank.csv", _record(0.7, 0.01))
 
-    def typed(*words: object) -> str:
-        result = CliRunner().invoke(app, [str(w) for w in words])
-        assert result.exit_code == 0, result.output
-        return result.output
-
-    of = ["--fmu", supplied("tank"), "--value", "valve=1"]
+    of = ("--fmu", supplied("tank"), "--value", "valve=1")
     out = tmp_path / "out.csv"
-    typed("simulate", *of, "--value", "area=0.7", "--input", record, "-o", out)
+    done("simulate", *of, "--value", "area=0.7", "--input", record, "-o", out)
     simulated = np.loadtxt(out, delimiter=",", skiprows=1)[:, 2]
     assert simulated == pytest.approx(level(0.7, 0.01), abs=1e-3)
     for name in ("fit.fmu", "fit.ssv", "fit.json"):
-        printed = typed("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
-        assert ("an importer must set the start values" in printed) == (name == "fit.fmu")
-    with zipfile.ZipFile(tmp_path / "fit.fmu") as archive:
-        root = ET.fromstring(archive.read("modelDescription.xml"))
+        ended = done("identify", *of, record, "--free", "area=0.05:4", "-o", tmp_path / name)
+        assert ("an importer must set the start values" in ended.words) == (name == "fit.fmu")
+    root = ET.fromstring(files_inside(tmp_path / "fit.fmu")["modelDescription.xml"])
     starts = {v.get("name"): v[0].get("start") for v in root.iterfind("ModelVariables/*")}
     value = psa.load_model(tmp_path / "fit.json", fmu=supplied("tank")).values["area"]
     assert float(str(starts["area"])) == pytest.approx(value)
     assert value == pytest.approx(0.7, rel=0.01)
     rows = ET.parse(tmp_path / "fit.ssv").getroot().findall(".//{*}Parameter")
     assert [(r.get("name"), r[0].get("unit")) for r in rows] == [("area", None), ("valve", None)]
-    bad = CliRunner().invoke(app, ["identify", "--free", "area=1:2", str(record)])
-    assert "add --fmu FILE.fmu" in bad.output
+    assert "add --fmu FILE.fmu" in refused("identify", "--free", "area=1:2", record)
 
 
 def with_effects() -> psa.Model:
@@ -256,7 +244,7 @@ def with_effects() -> psa.Model:
     return result.with_values(values)
 
 
-def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
+def test_effects_around_an_fmu_are_exported_around_it(tmp_path: Path) -> None:
     model = with_effects()
     path = psa.export_extended(model, tmp_path / "tank.ssp", step=0.05)
     fine = np.linspace(0.0, 100.0, 2001)
@@ -268,32 +256,33 @@ def test_what_was_found_around_an_fmu_stands_around_it(tmp_path: Path) -> None:
         )[:, 0]  # fmt: skip
     truth = lagged(level(0.7, 0.01, 0.88 * INFLOW), 3.0)
     assert np.interp(TIMES, fine, coupled) == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
-    with zipfile.ZipFile(path) as inside:
-        assert inside.read("resources/original.fmu") == supplied("tank").read_bytes()
-        root = ET.fromstring(inside.read("resources/original.ssv"))
+    inside = files_inside(path)
+    assert inside["resources/original.fmu"] == supplied("tank").read_bytes()
+    root = ET.fromstring(inside["resources/original.ssv"])
     kinds = {p.get("name"): p[0].tag.rpartition("}")[2] for p in root.iterfind(".//{*}Parameter")}
     assert kinds == {"area": "Real", "valve": "Boolean"}
     one = psa.export_extended(model, tmp_path / "tank.fmu")
-    inputs = np.array([*zip(fine, flow[:, 0], strict=True)], [("time", float), ("inflow", float)])
+    inputs = samples(time=fine, inflow=flow[:, 0])
     played = fmpy.simulate_fmu(
         str(one), stop_time=100.0, output_interval=0.05, input=inputs, output=["level"]
     )
     alone = np.interp(TIMES, played["time"], played["level"])
     assert alone == pytest.approx(truth, abs=0.01 * float(np.ptp(truth)))
     ball = psa.fmu_model(supplied("ball"), free={"g": (5.0, 20.0)})
-    with pytest.raises(psa.InputError, match=r"is of FMI 3\.0, which no FMU holds here"):
-        psa.export_extended(ball, tmp_path / "ball.fmu")
-    with pytest.raises(psa.InputError, match="is of no FMU"):
-        psa.export_extended(_own(), tmp_path / "none.ssp")
     smooth = psa.fmu_model(pendulum(), free={"length": (0.1, 5.0)})
-    with pytest.raises(psa.InputError, match="has no co-simulation, which can stand between"):
-        psa.export_extended(smooth, tmp_path / "none.ssp")
+    for wrong, name, match in (
+        (ball, "ball.fmu", r"is of FMI 3\.0, which no FMU holds here"),
+        (_first_order(), "none.ssp", "is of no FMU"),
+        (smooth, "none.ssp", "has no co-simulation, which can stand between"),
+    ):
+        with pytest.raises(psa.InputError, match=match):
+            psa.export_extended(wrong, tmp_path / name)
 
 
 @pytest.mark.slow
 def test_an_fmu_that_holds_another_one_keeps_to_the_standard(tmp_path: Path) -> None:
     path = psa.export_extended(with_effects(), tmp_path / "tank.fmu")
-    assert {r.name for r in psa.check_fmu(path, foreign=True).failures} <= {"memory"}  # PythonFMU's
+    assert {r.name for r in psa.check_fmu(path).failures} <= {"memory"}  # PythonFMU's
 
 
 def test_a_process_that_was_ended_by_others_is_replaced() -> None:

@@ -1,25 +1,17 @@
 """`psa check` of FMUs of other tools: each fault of a small one fails its row alone."""
 
 import json
-import tempfile
-import zipfile
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import fmpy
 import pytest
-from typer.testing import CliRunner
 
 import psa_casadi as psa
-from psa_casadi.cli.app import app
-from psa_casadi.simulation.compiler import compiler_command, run_compiler
-from tests.export.supplied import supplied
+from tests.contract.helpers import command
+from tests.export.supplied import compiled_fmu, supplied
 from tests.tiers import slow_but
 
-_SOURCES = Path(__file__).with_name("faulty")
-_FOLDER = tempfile.TemporaryDirectory()
 #: The row that each fault fails, and its remark.
 FAULTS = {
     1: ("start values", "'k' starts at 2.5, its description says 2"),
@@ -42,19 +34,10 @@ _ALSO = {4: {"life cycle", "state saved"}}
 @cache
 def faulty(number: int, lines: str = "false") -> Path:
     """Return the FMU with a fault, 0 for none, that takes `lines` as inputs or does not say so."""
-    folder = Path(_FOLDER.name) / f"{number}{lines}"
-    folder.mkdir()
-    library = folder / f"filter{fmpy.sharedLibraryExtension}"
-    (folder / "filter.c").write_bytes((_SOURCES / "filter.c").read_bytes())
-    command = [*compiler_command(), "-O1", "-fPIC", "-shared", f"-I{files('fmpy') / 'c-code'}"]
-    run_compiler([*command, f"-DFAULT={number}", "filter.c", "-o", str(library)], folder)
-    template = (_SOURCES / "modelDescription.xml").read_text("utf-8")
     initial = "" if number == 10 else '<Unknown index="4"/>'
-    with zipfile.ZipFile(folder / "filter.fmu", "w") as archive:
-        text = template.format(known="1" if number == 8 else "1 3", initial=initial, lines=lines)
-        archive.writestr("modelDescription.xml", text)
-        archive.write(library, f"binaries/{fmpy.platform}/{library.name}")
-    return folder / "filter.fmu"
+    known = "1" if number == 8 else "1 3"
+    flag = f"-DFAULT={number}"
+    return compiled_fmu("faulty/filter.c", flag, known=known, initial=initial, lines=lines)
 
 
 def test_an_fmu_without_a_fault_passes() -> None:
@@ -69,7 +52,7 @@ def test_an_fmu_without_a_fault_passes() -> None:
 
 
 @pytest.mark.parametrize("number", slow_but([1, 8], FAULTS))
-def test_each_fault_is_found_by_its_row(number: int) -> None:
+def test_each_fault_fails_its_row(number: int) -> None:
     rows = {r.name: r for r in psa.check_fmu(faulty(number)).failures}
     name, remark = FAULTS[number]
     assert remark in rows[name].remark
@@ -79,24 +62,23 @@ def test_each_fault_is_found_by_its_row(number: int) -> None:
 
 def test_the_command_writes_the_clauses(tmp_path: Path) -> None:
     json_file, junit = tmp_path / "check.json", tmp_path / "check.xml"
-    words = ["check", str(faulty(8)), "--json", str(json_file), "--junit", str(junit)]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 1
-    assert "FMI 2.0, 2.2.8" in result.output
-    assert "did not pass: dependencies. It was checked by the standard" in result.output
+    ended = command("check", faulty(8), "--json", json_file, "--junit", junit)
+    assert ended.code == 1
+    assert "FMI 2.0, 2.2.8" in ended.out
+    assert "did not pass: dependencies. It was checked by the standard" in ended.words
     rows = {r["name"]: r for r in json.loads(json_file.read_text("utf-8"))["rows"]}
     assert (rows["dependencies"]["clause"], rows["speed"]["noted"]) == ("FMI 2.0, 2.2.8", True)
     cases = ET.parse(junit).getroot().iter("testcase")
     assert [c.get("name") for c in cases if c.find("failure") is not None] == ["dependencies"]
 
 
-def test_what_a_tool_s_fmus_lack_is_told() -> None:
+def test_what_a_tool_s_fmus_lack_is_reported() -> None:
     tank = {r.name for r in psa.check_fmu(supplied("tank")).failures}
     assert tank <= {"description valid", "memory"}  # PythonFMU 0.7: no initial unknowns, a leak
     assert psa.check_fmu(supplied("ball")).passed
 
 
-def test_one_of_ours_is_checked_so_where_it_is_asked(tmp_path: Path) -> None:
+def test_one_of_ours_is_checked_so_on_request(tmp_path: Path) -> None:
     path = psa.export_fmu(psa.stack_model("P-885.51"), tmp_path / "stack.fmu", fmi=3)
     report = psa.check_fmu(path, foreign=True)
     assert [(r.name, r.remark) for r in report.failures] == []

@@ -54,9 +54,7 @@ def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
 
 def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> psa.Component:
     return psa.Component(
-        "decay",
-        'a "decay" \\ of <z>',
-        "none",
+        "decay", 'a "decay" \\ of <z>', "none",
         lambda s: psa.Equations(
             der={state: -getattr(s, parameter) * getattr(s, state) + s.pull},
             out={output: 2 * getattr(s, state)},
@@ -65,7 +63,7 @@ def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> 
         states=(psa.State(state, "counts", "z", 1.0, start=1.0),),
         inputs=(psa.Input("pull", "counts/s", "pull", start=0.5),),
         outputs=(psa.Output(output, "counts", "twice z"),),
-    )
+    )  # fmt: skip
 
 
 def test_names_that_modelica_has_taken_are_changed_and_texts_escaped() -> None:
@@ -89,32 +87,8 @@ def test_a_name_that_no_package_can_have_is_refused(name: str) -> None:
         modelica_text(psa.stack_model("P-885.51"), name=name)
 
 
-def test_names_that_clash_are_refused() -> None:
-    with pytest.raises(psa.InputError, match="named 'z', which Modelica does not allow"):
-        modelica_text(psa.compose([_decay(output="z")]))
-    with pytest.raises(
-        psa.InputError, match="output 'tip_force' of 'psa' differs from the balance"
-    ):
-        modelica_text(psa.compose([*psa.BASE, _decay(output="tip_force")]))
-
-
-def test_a_start_that_is_not_finite_is_refused(tmp_path: Path) -> None:
-    endless = psa.Component(
-        "endless",
-        "no start",
-        "none",
-        lambda s: psa.Equations(der={"z": -s.z}),
-        states=(psa.State("z", "1", "z", 1.0, start=float("inf")),),
-    )
-    with pytest.raises(
-        psa.InputError, match="start of state 'z' is inf, which Modelica cannot write"
-    ):
-        psa.export_modelica(psa.compose([endless]), tmp_path / "x.mo")
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize(("start", "rests"), [(0.0, True), (2.0, True), (1.0, False)])
-def test_the_text_says_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
+def test_the_text_states_whether_the_states_rest_at_the_start(start: float, rests: bool) -> None:
     """x' = x (2 - x) rests at 0 and at 2."""
     x = ca.SX.sym("x")
     states = [psa.State("x", "1", "a population", 1.0, start=start)]
@@ -182,10 +156,9 @@ def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
     got = simulated(STUB + text, _WIRED, span, rtol=1e-10)
     t = got["time"]
     expected = _by_hand(dict(model.values), text, t)
-    for values, name_of_it in zip(
-        expected, ("stack.displacement", "mass.s", "stack.current"), strict=True
-    ):
-        assert np.abs(got[name_of_it] - values).max() < 1e-6 * np.ptp(values), name_of_it
+    names = ("stack.displacement", "mass.s", "stack.current")
+    for output, values in zip(names, expected, strict=True):
+        assert np.abs(got[output] - values).max() < 1e-6 * np.ptp(values), output
 
 
 @pytest.mark.parametrize(
@@ -195,8 +168,7 @@ def test_the_wired_example_follows_equations_written_by_hand(name: str) -> None:
     ),
 )
 def test_every_wired_example_is_a_balanced_system(name: str) -> None:
-    model = load(STUB + text_of(name), _WIRED)
-    structure = model.structure()
+    structure = load(STUB + text_of(name), _WIRED).structure()
     assert structure.is_balanced
     assert structure.is_matched
 
@@ -320,23 +292,17 @@ _EXPRESSIONS = st.recursive(
 def _model(first: Build, second: Build) -> Any:
     """Three states whose rates hold the expressions, one of them twice."""
     states = tuple(psa.State(n, "1", n, 1.0) for n in _NAMES)
-    return psa.compose(
-        [
-            psa.Component(
-                "random",
-                "random rates",
-                "none",
-                lambda s: psa.Equations(
-                    der={
-                        "alpha": first(s),
-                        "beta": second(s) + s.alpha,
-                        "gamma": first(s) * second(s) - s.beta,
-                    }
-                ),
-                states=states,
-            )
-        ]
-    )
+
+    def equations(s: psa.Symbols) -> psa.Equations:
+        rates = (first(s), second(s) + s.alpha, first(s) * second(s) - s.beta)
+        return psa.Equations(der=dict(zip(_NAMES, rates, strict=True)))
+
+    return psa.compose([psa.Component("random", "random rates", "none", equations, states=states)])
+
+
+def _with(function: Any) -> Any:
+    """Return a model with a function of its first state."""
+    return _model(lambda s: function(s.alpha), lambda s: s.beta)
 
 
 def _as_numbers(source: str) -> str:
@@ -378,29 +344,43 @@ def test_expressions_survive_being_written_and_read(first: Build, second: Build,
     "function",
     [ca.log10, ca.log1p, ca.expm1, ca.asinh, lambda x: ca.hypot(x, 3.0), lambda x: ca.asin(x / 9)],
 )
-def test_functions_that_modelica_says_in_other_words(function: Any) -> None:
-    model = _model(lambda s: function(s.alpha), lambda s: s.beta)
+def test_functions_that_modelica_writes_otherwise(function: Any) -> None:
+    model = _with(function)
     read = read_back(pure_ode(model, modelica_text(model)))
     for value in (0.3, 1.0, 7.5):
         got = np.array(read.rhs(0.0, [value, 1.0, 1.0], [], [])).ravel()[0]
         assert got == pytest.approx(float(function(ca.DM(value))), rel=1e-14)
 
 
+def _endless(start: float) -> psa.Model:
+    states = (psa.State("z", "1", "z", 1.0, start=start),)
+    endless = psa.Component(
+        "endless", "no start", "none", lambda s: psa.Equations(der={"z": -s.z}), states=states
+    )
+    return psa.compose([endless])
+
+
 @pytest.mark.parametrize(
-    ("function", "name"), [(ca.erf, "erf"), (lambda x: ca.fmod(x, 2.0), "fmod"),
-                           (lambda x: ca.copysign(x, -x), "copysign")],
+    ("make", "match"),
+    [
+        (lambda: psa.compose([_decay(output="z")]), "named 'z', which Modelica does not allow"),
+        (lambda: psa.compose([*psa.BASE, _decay(output="tip_force")]),
+         "output 'tip_force' of 'psa' differs from the balance"),
+        (lambda: _endless(math.inf), "start of state 'z' is inf, which Modelica cannot write"),
+        (lambda: _with(ca.erf), "uses 'erf'"),
+        (lambda: _with(lambda x: ca.fmod(x, 2.0)), "uses 'fmod'"),
+        (lambda: _with(lambda x: ca.copysign(x, -x)), "uses 'copysign'"),
+        (lambda: _with(lambda x: x * math.inf), "constant inf, which Modelica cannot write"),
+        (lambda: _with(lambda x: x * -math.inf), "constant -inf, which Modelica cannot write"),
+        (lambda: _with(lambda x: x * math.nan), "constant nan, which Modelica cannot write"),
+    ],
 )  # fmt: skip
-def test_a_function_that_modelica_lacks_is_refused_by_its_name(function: Any, name: str) -> None:
-    model = _model(lambda s: function(s.alpha), lambda s: s.beta)
-    with pytest.raises(psa.InputError, match=f"uses '{name}'"):
-        modelica_text(model)
-
-
-@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
-def test_a_constant_that_is_not_finite_is_refused(value: float) -> None:
-    model = _model(lambda s: s.alpha * value, lambda s: s.beta)
-    with pytest.raises(psa.InputError, match=r"constant (-?inf|nan), which Modelica cannot write"):
-        modelica_text(model)
+def test_what_modelica_cannot_hold_is_refused(
+    make: Callable[[], psa.Model], match: str, tmp_path: Path
+) -> None:
+    with pytest.raises(psa.InputError, match=match):
+        psa.export_modelica(make(), tmp_path / "x.mo")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

@@ -3,14 +3,14 @@
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import rumoca
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.export.check.check import check_fmu
 from psa_casadi.export.importer.fmu import (
     CO_SIMULATION,
     DISCARD,
@@ -21,11 +21,7 @@ from psa_casadi.export.importer.fmu import (
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model.component import Component, Equations, Expression, Symbols
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.variables import Input, Output, Parameter, State
-from psa_casadi.simulation.stepper import run
-from tests.export.fmu_models import exported
+from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import load
 from tests.model.sampled_models import (
     ALONE,
@@ -58,7 +54,7 @@ def inputs(times: FloatArray, slope: float) -> FloatArray:
 def test_the_loop_follows_the_exact_recursion(name: str) -> None:
     times, slope = GRIDS[name], 30.0
     truth = expected(times, 1.0, slope)
-    steps = run(loop(), times, inputs(times, slope), np.zeros(1), rtol=1e-12)
+    steps = psa.run(loop(), times, inputs(times, slope), np.zeros(1), rtol=1e-12)
     assert np.abs(steps.x[:, 0] - truth.position).max() < 1e-9
     assert np.abs(steps.z - truth.z).max() < 1e-9
     assert np.abs(steps.y - np.column_stack([truth.position, truth.voltage])).max() < 1e-9
@@ -69,7 +65,7 @@ def test_a_held_input_is_sampled_after_its_jump() -> None:
     times = grid(4, 1.0)
     reference = np.array([0.0, 0.0, 1.0, 1.0])
     u = np.column_stack([np.zeros(4), reference])
-    z = run(loop(), times, u, np.zeros(1), hold="zero").z
+    z = psa.run(loop(), times, u, np.zeros(1), hold="zero").z
     assert z[1, 1] == 0.0
     assert z[2, 1] == loop().values["k_p"]
 
@@ -77,7 +73,7 @@ def test_a_held_input_is_sampled_after_its_jump() -> None:
 def test_a_model_of_sampled_states_only() -> None:
     model, times = controller(), grid(41, 0.25)
     u = np.column_stack([np.ones_like(times), 0.3 * np.sin(400.0 * times)])
-    steps = run(model, times, u, np.zeros(0))
+    steps = psa.run(model, times, u, np.zeros(0))
     integral, command, rows = 0.0, 0.0, []
     for k, (reference, position) in enumerate(u):
         if k % 4 == 0:
@@ -91,39 +87,28 @@ def test_a_model_of_sampled_states_only() -> None:
 
 def test_balances_in_next_are_those_before_the_instant() -> None:
     """A sampled state that adds to a balance and reads it: z_k = 1 + z_(k-1)."""
-    counter = Component(
-        name="counter",
-        description="counts instants",
-        source="none",
-        parameters=(Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),),
-        sampled=(State("count", "m", "number of instants", nominal=1.0),),
-        sample_period="T_s",
-        equations=lambda s: Equations(
-            add={"displacement": s.count}, next={"count": s.displacement + 1.0}
-        ),
-    )
-    times = grid(4, 1.0)
-    assert run(compose([counter]), times, np.zeros((4, 0)), np.zeros(0)).z[:, 0].tolist() == [
-        1.0, 2.0, 3.0, 4.0,
-    ]  # fmt: skip
+    counter = psa.Component(
+        "counter", "counts instants", "none",
+        lambda s: psa.Equations(add={"displacement": s.count}, next={"count": s.displacement + 1}),
+        parameters=(psa.Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),),
+        sampled=(psa.State("count", "m", "number of instants", nominal=1.0),), sample_period="T_s",
+    )  # fmt: skip
+    steps = psa.run(psa.compose([counter]), grid(4, 1.0), np.zeros((4, 0)), np.zeros(0))
+    assert steps.z[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]
 
 
-def _second(**changes: object) -> Component:
+def _second(**changes: object) -> psa.Component:
     """Return a sampled counter with another period, with changes."""
     second = replace(
-        ALONE,
-        name="second",
-        parameters=(Parameter("T_2", 1.0, "s", (0.1, 1.0), "period"),),
-        sampled=(State("more", "1", "more", nominal=1.0),),
-        sample_period="T_2",
-        inputs=(),
-        outputs=(),
-        equations=lambda s: Equations(next={"more": s.more}),
-    )
+        ALONE, name="second", sample_period="T_2", inputs=(), outputs=(),
+        parameters=(psa.Parameter("T_2", 1.0, "s", (0.1, 1.0), "period"),),
+        sampled=(psa.State("more", "1", "more", nominal=1.0),),
+        equations=lambda s: psa.Equations(next={"more": s.more}),
+    )  # fmt: skip
     return replace(second, **changes)  # type: ignore[arg-type]  # of its fields
 
 
-_ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
+_ZERO = replace(PLANT, name="p", parameters=(psa.Parameter("T_0", 1.0, "s", (0.0, 1.0), "period"),))
 
 
 @pytest.mark.parametrize(
@@ -134,28 +119,29 @@ _ZERO = replace(PLANT, name="p", parameters=(Parameter("T_0", 1.0, "s", (0.0, 1.
          "'T_none' of component 'sampled_pi' is no parameter"),
         ((_ZERO, replace(CONTROLLER, sample_period="T_0")), "'T_0' may be 0 by its bounds"),
         ((PLANT, CONTROLLER, _second()), r"different periods \(T_2, T_s\)"),
-        ((PLANT, replace(CONTROLLER, equations=lambda s: Equations(out={"voltage": s.command}))),
+        ((PLANT, replace(CONTROLLER, equations=lambda s: psa.Equations(
+            out={"voltage": s.command}))),
          "lacks the next value of the sampled state 'command'"),
-        ((PLANT, replace(CONTROLLER, outputs=(), equations=lambda s: Equations(
+        ((PLANT, replace(CONTROLLER, outputs=(), equations=lambda s: psa.Equations(
             next={"integral": s.integral, "command": s.command, "gain": 1.0}))),
          "sampled state 'gain', which it does not declare"),
         ((PLANT, ALONE), "Two components declare 'position'"),
     ],
 )  # fmt: skip
-def test_mistakes_of_a_declaration_are_named(components: tuple[Component, ...], match: str) -> None:
-    with pytest.raises(InputError, match=match):
-        compose(components)
+def test_mistakes_of_a_declaration_are_named(components: Any, match: str) -> None:
+    with pytest.raises(psa.InputError, match=match):
+        psa.compose(components)
 
 
 def test_two_components_share_a_period() -> None:
-    same = compose((PLANT, CONTROLLER, _second(parameters=(), sample_period="T_s")))
+    same = psa.compose((PLANT, CONTROLLER, _second(parameters=(), sample_period="T_s")))
     assert same.sampled_names == ("integral", "command", "more")
 
 
 def test_sensitivities_are_refused() -> None:
     times = grid(4, 1.0)
-    with pytest.raises(InputError, match="Sensitivities of a model with sampled states"):
-        run(loop(), times, inputs(times, 0.0), np.zeros(1), unknowns=["k_p"])
+    with pytest.raises(psa.InputError, match="Sensitivities of a model with sampled states"):
+        psa.run(loop(), times, inputs(times, 0.0), np.zeros(1), unknowns=["k_p"])
 
 
 VERSIONS = pytest.mark.parametrize("fmi", [2, 3])
@@ -195,8 +181,7 @@ def test_derivatives_hold_the_sampled_states(fmi: int) -> None:
 @pytest.mark.usefixtures("code_runs_here")
 @pytest.mark.parametrize(("name", "fmi"), slow_but([("loop", 3)], [("loop", 3), ("controller", 2)]))
 def test_check_passes(name: str, fmi: int) -> None:
-    model = loop() if name == "loop" else controller()
-    report = check_fmu(exported(name, fmi), model)
+    report = psa.check_fmu(exported(name, fmi), model_named(name))
     assert report.compared
     assert report.failures == ()
 
@@ -284,7 +269,7 @@ def test_time_events_of_model_exchange(fmi: int) -> None:
 COUNT = 121
 
 
-def simulated(model: Model, inputs: str, names: tuple[str, ...]) -> Mapping[str, FloatArray]:
+def simulated(model: psa.Model, inputs: str, names: tuple[str, ...]) -> Mapping[str, FloatArray]:
     """Return variables of `Signal` on the grid of quarters of a period, at instants after them."""
     harness = f"model Harness PiezoStack.Signal it({inputs}); end Harness;"
     config = rumoca.SimConfig(solver="bdf", rtol=1e-11, atol=1e-16, dt=PERIOD / 4)
@@ -304,45 +289,32 @@ def test_rumoca_follows_the_exact_recursion() -> None:
         assert np.abs(result[name] - column).max() < 1e-8, name
 
 
-def _shared() -> Model:
+def _shared() -> psa.Model:
     """Return a model whose next values share a long part, and read a balance that they move."""
 
-    def equations(s: Symbols) -> Equations:
-        part = _long_part(s)
-        return Equations(
-            add={"displacement": s.first + s.level},
-            der={"level": (s.push - s.level) / 5e-3},
-            next={
-                "first": 0.3 * part + 0.1 * s.displacement,
-                "second": 0.2 * part * part - 0.5 * s.second,
-            },
+    def equations(s: psa.Symbols) -> psa.Equations:
+        x, z, w = s.level, s.first, s.second
+        part = (x - z) / (1.0 + (x + 2.0 * z) ** 2 + 0.3 * w**2) + 0.1 * z
+        return psa.Equations(
+            add={"displacement": z + x},
+            der={"level": (s.push - x) / 5e-3},
+            next={"first": 0.3 * part + 0.1 * s.displacement, "second": 0.2 * part**2 - 0.5 * w},
             out={"shown": s.displacement},
         )
 
-    return compose(
-        [
-            Component(
-                name="shared",
-                description="next values that share a part",
-                source="none",
-                parameters=(Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),),
-                states=(State("level", "m", "level", nominal=1.0),),
-                sampled=(
-                    State("first", "m", "first", nominal=1.0, start=0.2),
-                    State("second", "m", "second", nominal=1.0),
-                ),
-                sample_period="T_s",
-                inputs=(Input("push", "m", "push", nominal=1.0),),
-                outputs=(Output("shown", "m", "displacement"),),
-                equations=equations,
-            )
-        ]
-    )
-
-
-def _long_part(s: Symbols) -> Expression:
-    x, z, w = s.level, s.first, s.second
-    return (x - z) / (1.0 + (x + 2.0 * z) ** 2 + 0.3 * w**2) + 0.1 * z
+    shared = psa.Component(
+        "shared", "next values that share a part", "none", equations,
+        parameters=(psa.Parameter("T_s", PERIOD, "s", (1e-6, 1.0), "sample period"),),
+        states=(psa.State("level", "m", "level", nominal=1.0),),
+        sampled=(
+            psa.State("first", "m", "first", nominal=1.0, start=0.2),
+            psa.State("second", "m", "second", nominal=1.0),
+        ),
+        sample_period="T_s",
+        inputs=(psa.Input("push", "m", "push", nominal=1.0),),
+        outputs=(psa.Output("shown", "m", "displacement"),),
+    )  # fmt: skip
+    return psa.compose([shared])
 
 
 def test_shared_parts_and_balances_have_their_values_before_the_instant() -> None:
@@ -354,7 +326,7 @@ def test_shared_parts_and_balances_have_their_values_before_the_instant() -> Non
     assert "displacement" not in clause
     result = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "shown"))
     times = grid(COUNT, 0.25)
-    steps = run(model, times, (1.0 - 30.0 * times)[:, None], np.zeros(1), rtol=1e-12)
+    steps = psa.run(model, times, (1.0 - 30.0 * times)[:, None], np.zeros(1), rtol=1e-12)
     for name, column in (("first", steps.z[:, 0]), ("second", steps.z[:, 1])):
         assert np.abs(result[name] - column).max() < 1e-8, name
     assert np.abs(result["shown"] - steps.y[:, 0]).max() < 1e-8

@@ -10,31 +10,23 @@ import pytest
 from fmpy.ssp.ssd import read_ssd
 from lxml import etree  # type: ignore[import-untyped]
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
+from psa_casadi.export import ssp
 from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.export.ssp import (
-    OUTSIDE,
-    Port,
-    export_ssp,
-    layout_of,
-    save_wiring,
-    shared_parameters,
-    stable_step,
-    wiring_of,
-)
-from psa_casadi.model.nanopositioner import nanopositioner
-from psa_casadi.model.system import System
 from tests.export.fmu_models import assert_valid, model_named
-from tests.export.ssp_master import SspArchive, couple, points, settles
-from tests.export.ssp_systems import (
+from tests.export.ssp_master import (
     END,
     RATE,
     STACK,
+    SspArchive,
     archive_of,
     closed_loop,
+    couple,
     monolithic,
+    points,
     pushed_stage,
+    settles,
 )
 from tests.tiers import slow, slow_but
 
@@ -67,13 +59,9 @@ def test_every_file_follows_its_schema_and_names_what_the_fmus_have(name: str) -
             for connector in component.connectors:
                 assert known[connector.name].causality == connector.kind
         for part, values in archive.parameters.items():
-            assert {n: known_start(archive, part, n) for n in values} == values
+            starts = {v.name: v.start for v in archive.fmus[part].description.modelVariables}
+            assert {n: float(starts[n]) for n in values} == values
             assert {*values} == {*archive.fmus[part].names("parameter")} - {*OPTIONS}
-
-
-def known_start(archive: SspArchive, part: str, name: str) -> float:
-    variables = archive.fmus[part].description.modelVariables
-    return float(next(v.start for v in variables if v.name == name))
 
 
 @slow
@@ -84,34 +72,34 @@ def test_units_of_connectors_are_defined_and_equal_across_every_wire() -> None:
     units = {}
     for connector in root.iter("{*}Connector"):
         owner = connector.getparent().getparent()
-        part = OUTSIDE if etree.QName(owner).localname == "System" else owner.get("name")
-        units[Port(part, connector.get("name"))] = connector.find("{*}Real").get("unit")
+        part = ssp.OUTSIDE if etree.QName(owner).localname == "System" else owner.get("name")
+        units[ssp.Port(part, connector.get("name"))] = connector.find("{*}Real").get("unit")
     assert set(units.values()) <= set(defined)
-    wires = wiring_of(closed_loop()).wires
+    wires = ssp.wiring_of(closed_loop()).wires
     assert len(units) > len(wires)
     assert all(units[w.start] == units[w.end] for w in wires)
 
 
 def test_the_same_system_gives_the_same_bytes(tmp_path: Path) -> None:
-    again = export_ssp(pushed_stage(), tmp_path / "again.ssp")
+    again = psa.export_ssp(pushed_stage(), tmp_path / "again.ssp")
     assert again.read_bytes() == archive_of("pushed_stage").read_bytes()
 
 
 @slow
 def test_the_compensator_keeps_the_parameters_of_its_stack() -> None:
-    shared = shared_parameters(closed_loop().parts)
+    shared = ssp.shared_parameters(closed_loop().parts)
     assert set(shared["k_L"]) == {"compensator", "stack"}
     assert {"A", "beta", "gamma", "delta", "n"} <= set(shared)
     other = model_named(STACK).with_values({"beta": 0.9 * model_named(STACK).values["beta"]})
-    mistuned = nanopositioner(STACK, compensator_stack=other.plant())
-    assert "beta" not in shared_parameters(mistuned.parts)
+    mistuned = psa.nanopositioner(STACK, compensator_stack=other.plant())
+    assert "beta" not in ssp.shared_parameters(mistuned.parts)
     mapping = texts(archive_of("closed_loop"))["resources/shared.ssm"]
     assert re.findall(r'source="k_L" target="(.*?)"', mapping) == ["compensator.k_L", "stack.k_L"]
 
 
 def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
-    wiring = wiring_of(closed_loop())
-    layout = layout_of(wiring)
+    wiring = ssp.wiring_of(closed_loop())
+    layout = ssp.layout_of(wiring)
     pieces = [
         (wire, *np.sort(ends, axis=0))
         for wire, path in zip(wiring.wires, layout.paths, strict=True)
@@ -130,33 +118,33 @@ def test_no_wire_runs_through_a_part_or_on_another_wire() -> None:
 
 @slow
 def test_the_picture_shows_every_part_and_port(tmp_path: Path) -> None:
-    wiring = wiring_of(closed_loop())
-    layout = layout_of(wiring)
-    svg = save_wiring(wiring, layout, tmp_path / "wiring.svg").read_bytes()
+    wiring = ssp.wiring_of(closed_loop())
+    layout = ssp.layout_of(wiring)
+    svg = ssp.save_wiring(wiring, layout, tmp_path / "wiring.svg").read_bytes()
     with zipfile.ZipFile(archive_of("closed_loop")) as archive:
         assert archive.read("documentation/wiring.svg") == svg
     root = etree.fromstring(svg)
     items = [e.text for e in root.iter("{*}text")]
     assert set(wiring.parts) <= set(items)
     assert {p.name for p in layout.places if p.part} <= set(items)
-    png = save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
+    png = ssp.save_wiring(wiring, layout, tmp_path / "wiring.png").read_bytes()
     assert png.startswith(b"\x89PNG")
-    with pytest.raises(InputError, match=r"\.svg or \.png"):
-        save_wiring(wiring, layout, tmp_path / "wiring.gif")
+    with pytest.raises(psa.InputError, match=r"\.svg or \.png"):
+        ssp.save_wiring(wiring, layout, tmp_path / "wiring.gif")
 
 
 def test_a_system_that_cannot_be_wired_is_refused_before_anything_is_compiled(
     tmp_path: Path,
 ) -> None:
     wires = (*pushed_stage().wires, ("flexure.stage_position", "stack.load_force"))
-    wrong = System(**{**vars(pushed_stage()), "wires": wires})
-    with pytest.raises(InputError, match="load_force"):
-        export_ssp(wrong, tmp_path / "wrong.ssp")
+    wrong = psa.System(**{**vars(pushed_stage()), "wires": wires})
+    with pytest.raises(psa.InputError, match="load_force"):
+        psa.export_ssp(wrong, tmp_path / "wrong.ssp")
     assert not (tmp_path / "wrong.ssp").exists()
 
 
 @pytest.mark.parametrize("name", slow_but(["pushed_stage"], ["pushed_stage", "closed_loop"]))
-def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
+def test_the_archive_has_what_omsimulator_requires(name: str) -> None:
     """As its importer reads it: this annotation, by these prefixes, and no canvas.
 
     OMSimulator 3.0.0.post114 ended with "Unable to add System" without the one, and with "wrong
@@ -174,9 +162,9 @@ def test_the_archive_says_what_omsimulator_asks_for(name: str) -> None:
     root = etree.fromstring(text.encode())
     assert root.nsmap["oms"].endswith("/OMSimulator/master/schema/oms.xsd")
     assert [c.tag.partition("}")[2] for c in root[0]][-2:] == ["Connections", "Annotations"]
-    wiring = wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
+    wiring = ssp.wiring_of(pushed_stage() if name == "pushed_stage" else closed_loop())
     step = float(result[1])
-    assert 0.0 < step <= 0.05 * stable_step(wiring, rates=False)
+    assert 0.0 < step <= 0.05 * ssp.stable_step(wiring, rates=False)
     assert step <= 1e-3 * float(root.find("{*}DefaultExperiment").get("stopTime"))
     assert f"{step:.0e}"[0] in "125"
     results = re.search(
@@ -208,7 +196,7 @@ def test_two_parts_approach_an_independent_solution(rates: bool, order: int) -> 
 
 @pytest.mark.parametrize("rates", [False, True])
 def test_the_predicted_step_is_where_the_coupling_turns_unstable(rates: bool) -> None:
-    limit = stable_step(wiring_of(pushed_stage()), rates=rates)
+    limit = ssp.stable_step(ssp.wiring_of(pushed_stage()), rates=rates)
     with SspArchive(archive_of("pushed_stage")) as archive:
         assert settles(archive, 0.95 * limit, {}, slopes=rates)
         assert not settles(archive, 1.05 * limit, {}, slopes=rates)

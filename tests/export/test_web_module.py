@@ -11,6 +11,7 @@ from psa_casadi.export.web import web_module
 from psa_casadi.report.page.live import live_data
 from psa_casadi.simulation.simulate import accurate, input_samples
 from psa_casadi.simulation.start import start_on
+from tests.contract.helpers import off
 from tests.model.sampled_models import controller
 from tests.report.browser import Browser, find_browser
 from tests.report.live_pages import case, run_in_browser
@@ -33,11 +34,6 @@ def loops(samples: int = 400, period: float = 0.02) -> tuple[FloatArray, FloatAr
     v = 60.0 - 50.0 * np.cos(2.0 * np.pi * t / period + 0.5) * np.where(t < period, 1.0, 0.4)
     v[t > 1.8 * period] += 15.0
     return t, v
-
-
-def off(result: FloatArray, wanted: FloatArray) -> float:
-    """Return the largest difference over the range."""
-    return float(np.max(np.abs(result - wanted)) / np.ptp(wanted))
 
 
 def inputs(model: psa.Model, v: FloatArray) -> FloatArray:

@@ -8,13 +8,19 @@ import pytest
 
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.advice import Advice, advice, plans
-from psa_casadi.identification.combinations import Combination, free_combinations, physical_formulas
-from psa_casadi.identification.determinacy import Determinacy, covariance_of, determinacy
+from psa_casadi.identification.determinacy import (
+    Combination,
+    Determinacy,
+    covariance_of,
+    determinacy,
+    free_combinations,
+    physical_formulas,
+)
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.model.compose import Model
 from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, whole
-from psa_casadi.report.words.advice_words import plan_words
+from psa_casadi.report.words.notes import plan_words
 from psa_casadi.simulation.simulate import simulate
 from tests.model.stack_models import stack
 from tests.studies.benchmarks.records import LOOP_FREQUENCIES, loop_voltage
@@ -43,7 +49,7 @@ def loops(name: str) -> tuple[Fit, tuple[Experiment, ...], Determinacy]:
     experiments = tuple(whole(r) for r in records)
     sigma = [NOISE * r.range_m for r in records]
     result = fit(model, experiments, FREE, sigma=sigma)
-    return result, experiments, determinacy(result, experiments)
+    return result, experiments, determinacy(result)
 
 
 UNITS_OF_FORCE = ("N/V", "N/(V.s)", "N", "kg", "N.s/m", "N/m")
@@ -166,17 +172,18 @@ def test_what_is_determined_or_free_by_itself_has_no_formula() -> None:
 @pytest.mark.parametrize("samples", [20, 90, 400])
 def test_slow_residuals_leave_no_negative_variance(samples: int) -> None:
     """Of residuals that swing slowly the correlation, cut off at its last lag, is none."""
-    result, experiments, _ = loops("P-885.51")
+    result, _, _ = loops("P-885.51")
     count = len(result.residuals)
     slow = result.sigma[0] * np.sin(2.0 * np.pi * np.arange(count) / samples)
-    covariance = covariance_of(replace(result, residuals=slow), experiments)
+    covariance = covariance_of(replace(result, residuals=slow))
     sizes = np.linalg.eigvalsh(covariance)
     assert sizes[0] >= -1e-9 * sizes[-1]
     assert np.all(np.diag(covariance) > 0.0)
 
 
 def advised(name: str) -> tuple[Advice, ...]:
-    return advice(*loops(name))
+    result, _, determined = loops(name)
+    return advice(result, determined)
 
 
 def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
@@ -193,8 +200,8 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
     ringing, last = results[-2:]
     assert ringing.sentence.startswith("If the mechanics ring, m_P and m_B would be determined")
     assert (last.kind, last.record) == ("force", None)
-    result, experiments, determined = loops("PTBS200")
-    advices = advice(result, experiments, determined, force_scale_given=True)
+    result, _, determined = loops("PTBS200")
+    advices = advice(result, determined, force_scale_given=True)
     assert [a.sentence for a in advices] == [a.sentence for a in results[:-1]]
 
 
@@ -217,7 +224,7 @@ def test_following_the_advice_determines_what_it_promises(name: str) -> None:
     both = [*experiments, *new]
     sigma = [*result.sigma, *[result.sigma[0]] * len(new)]
     again = fit(model, both, tuple(dict.fromkeys([*FREE, *promised])), sigma=sigma)
-    after = determinacy(again, both)
+    after = determinacy(again)
     assert not set(promised) & set(after.undetermined)
     for n in promised:
         error = after.standard_errors[n]
@@ -233,9 +240,9 @@ def test_what_no_record_can_determine_is_reported() -> None:
     record = measured(model, "loop", time, voltage, 3)
     experiments = [whole(record)]
     result = fit(model, experiments, ("k_L", "R_s", "C_p"), sigma=[NOISE * record.range_m])
-    determined = determinacy(result, experiments)
+    determined = determinacy(result)
     assert {"R_s", "C_p"} == set(determined.undetermined)
-    results = advice(result, experiments, determined)
+    results = advice(result, determined)
     nothing = [a for a in results if a.sentence.startswith("None of the ")]
     assert len(nothing) == 1
     assert set(determined.undetermined) <= set(nothing[0].parameters)

@@ -132,7 +132,7 @@ def test_the_parts_of_a_fit_belong_together() -> None:
     assert result.converged
     assert result.sigma == (SIGMA, SIGMA)
     measured = np.concatenate([np.asarray(e.record.displacement) for e in experiments])
-    predicted = np.concatenate(result.predicted(experiments))
+    predicted = np.concatenate(result.predicted())
     np.testing.assert_allclose(result.residuals, measured - predicted, rtol=0, atol=1e-3 * SIGMA)
     priors = result.theta / result.unknowns.prior
     cost = np.sum((result.residuals / SIGMA) ** 2) + np.sum(priors**2)
@@ -170,7 +170,7 @@ def test_a_record_that_is_held_out_starts_as_the_others_of_its_device_do() -> No
     wrong[lead] += 40.0 * SIGMA * np.linspace(-1.0, 1.0, int(lead.sum()))
     experiments = divided(records[:2], [replace(held, displacement=wrong)])
     result = fitted(model, experiments)
-    shared, item = result.predicted(experiments)[2], _from_first_tenth(result, experiments[2])
+    shared, item = result.predicted()[2], _from_first_tenth(result, experiments[2])
     truth = np.asarray(held.displacement)[~lead]
     errors = [float(np.std(x[~lead] - truth)) for x in (shared, item)]
     assert errors[0] < 1.1 * SIGMA < 2.0 * SIGMA < errors[1]
@@ -179,13 +179,13 @@ def test_a_record_that_is_held_out_starts_as_the_others_of_its_device_do() -> No
     apart = divided(records[:2], [replace(other, voltage=other.voltage + 5.0)])
     elsewhere = fitted(model, apart)
     plain = _from_first_tenth(elsewhere, apart[2])
-    np.testing.assert_allclose(elsewhere.predicted(apart)[2], plain, rtol=0, atol=0.1 * SIGMA)
+    np.testing.assert_allclose(elsewhere.predicted()[2], plain, rtol=0, atol=0.1 * SIGMA)
 
 
 def _from_first_tenth(whole_fit: Fit, held: Experiment) -> FloatArray:
     """The prediction of a record whose start and offset are fitted to its first tenth."""
     lead = Experiment(held.record, held.known, held.held_out)
-    return fit(whole_fit.model, [lead], [], sigma=[SIGMA]).predicted([lead])[0]
+    return fit(whole_fit.model, [lead], [], sigma=[SIGMA]).predicted()[0]
 
 
 def test_no_fit_sees_a_sample_of_a_record_that_is_held_out() -> None:
@@ -274,7 +274,7 @@ def test_fits_of_one_minimum_are_the_same_place_wherever_their_priors_count_from
         squares = float(np.sum((result.residuals / 2e-9) ** 2))
         assert result.data_cost == pytest.approx(squares, rel=1e-9)
     assert far.data_cost == pytest.approx(near.data_cost, abs=0.1)
-    assert same_place(near, far, experiments)
+    assert same_place(near, far)
 
 
 SAMPLES, STEP = 300, 2e-3
@@ -319,7 +319,7 @@ def test_the_reported_error_is_that_against_the_stepper() -> None:
     experiments = [whole(regular())]
     result = fitted_demo(experiments, SIGMA)
     fine = simulated_by(result, experiments, Way(1e-10, 1e-10, stepped=True))
-    gap = float(np.sqrt(np.mean((result.predicted(experiments)[0] - fine) ** 2)))
+    gap = float(np.sqrt(np.mean((result.predicted()[0] - fine) ** 2)))
     limit = allowed(experiments[0], SIGMA)
     assert gap <= limit
     assert gap <= 3.0 * result.simulated[0].errors[0] + 0.03 * limit
@@ -327,7 +327,7 @@ def test_the_reported_error_is_that_against_the_stepper() -> None:
 
 def simulated_by(fit: Fit, experiments: list[Experiment], way: Way) -> FloatArray:
     """Return the prediction (n,) of the first record on another way."""
-    return replace(fit, way=way).predicted(experiments)[0]
+    return replace(fit, way=way).predicted()[0]
 
 
 @pytest.mark.parametrize("sigma", [1e-9, 1e-12])
@@ -338,7 +338,7 @@ def test_a_quiet_record_is_simulated_as_finely_as_it_needs(sigma: float) -> None
     limit = allowed(experiments[0], sigma)
     assert output.way == STEPPER or output.errors[0] <= limit
     fine = simulated_by(result, experiments, Way(1e-11, 1e-11, stepped=True))
-    gap = result.predicted(experiments)[0] - fine
+    gap = result.predicted()[0] - fine
     assert np.sqrt(np.mean(gap**2)) <= 3.0 * limit
 
 

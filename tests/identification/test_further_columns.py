@@ -19,7 +19,7 @@ from psa_casadi.identification.fitting.fit import Objective, fit
 from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
-from psa_casadi.model.components.surroundings import FLEXURE
+from psa_casadi.model.components.surroundings import flexure
 from psa_casadi.records.split import split, whole
 from psa_casadi.simulation.simulate import Way
 from tests.studies.plants import further_columns as plants
@@ -124,7 +124,7 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
     with pytest.raises(
         psa.InputError, match="'monitor_voltage', but the model 'psa' does not give it"
     ):
-        columns_of(psa.compose([FLEXURE]), [r])
+        columns_of(psa.compose([flexure]), [r])
     result = columns_of(starting_model([r]), [r])
     assert result.fitted == ("monitor_voltage",)
     assert texts(result.left_out) == ("strain is left out: it never changes.",)

@@ -27,7 +27,7 @@ def test_the_plant_is_recovered_up_to_the_scale_of_force(seed: int) -> None:
     assert result.determinacy.on_bound == ()
     assert result.fit.rms == pytest.approx(noise(truth), rel=0.05)
     assert result.fit.sigma[0] == pytest.approx(noise(truth), rel=0.05)
-    clean = result.fit.predicted(result.experiments)[0] - truth.displacement
+    clean = result.fit.predicted()[0] - truth.displacement
     assert np.std(clean) < 0.12 * noise(truth)
     true = combinations(values_of(truth.stack))
     rated = {"u_rated": truth.stack.u_rated}
@@ -132,4 +132,4 @@ def test_a_fit_that_ends_where_nothing_can_be_simulated_stays_where_it_began(
     stack_identification = identified(2)
     first = stack_identification.fit
     monkeypatch.setattr(refitting, "fit", fails)
-    assert refit_or_keep(first, stack_identification.experiments, sigma=first.sigma) is first
+    assert refit_or_keep(first, sigma=first.sigma) is first

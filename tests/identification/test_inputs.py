@@ -155,7 +155,7 @@ def _record(*, smooth: bool) -> tuple[Fit, tuple[Experiment, ...]]:
 
 def test_a_smooth_voltage_is_detected_and_straight_lines_get_the_mean_of_its_curve() -> None:
     result, experiments = _record(smooth=True)
-    otherwise = smooth_between(result, experiments)
+    otherwise = smooth_between(result)
     assert otherwise is not None
     (moved,), note = otherwise
     assert note.code == "smooth_voltage"
@@ -168,15 +168,15 @@ def test_a_smooth_voltage_is_detected_and_straight_lines_get_the_mean_of_its_cur
     np.testing.assert_allclose((voltage - before)[last][5:-5], larger[5:-5], atol=0.01)
     again = fit(result.model, (moved,), result.unknowns.names, sigma=[NOISE])
     assert again.rms < 1.02 * NOISE < result.rms
-    assert smooth_between(again, (moved,)) is None
+    assert smooth_between(again) is None
 
 
 def test_straight_lines_and_other_errors_are_left_as_they_are() -> None:
     result, experiments = _record(smooth=False)
-    assert smooth_between(result, experiments) is None
+    assert smooth_between(result) is None
     time = experiments[0].record.time
     other = replace(result, residuals=result.residuals + 5e-8 * np.sin(700.0 * time))
-    assert smooth_between(other, experiments) is None
+    assert smooth_between(other) is None
 
 
 @pytest.mark.parametrize("stamps", [True, False])
@@ -194,7 +194,7 @@ def test_stamps_that_jitter_are_distinguished_from_samples_that_do(stamps: bool)
     displayed = np.interp(taken, fine, x) + NOISE * random.standard_normal(COUNT)
     record = Record(name="r", time=late, voltage=_chirp(taken), displacement=displayed)
     result = fit(model, (whole(record),), FREE[:4], sigma=[NOISE])
-    otherwise = even_clock(result, (whole(record),))
+    otherwise = even_clock(result)
     assert (otherwise is not None) == stamps
     if otherwise is not None:
         (moved,), note = otherwise
@@ -202,7 +202,7 @@ def test_stamps_that_jitter_are_distinguished_from_samples_that_do(stamps: bool)
         np.testing.assert_allclose(moved.record.time, even, atol=0.01 * INTERVAL)
         again = fit(result.model, (moved,), FREE[:4], sigma=[NOISE])
         assert again.rms < 1.05 * NOISE < 0.5 * result.rms
-        assert even_clock(again, (moved,)) is None
+        assert even_clock(again) is None
 
 
 @pytest.mark.slow

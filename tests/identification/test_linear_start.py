@@ -374,7 +374,7 @@ def test_vector_fitting_finds_the_poles() -> None:
     w = np.where(np.arange(1500) < 10, 0.0, 1e-5)
     y = respond(mechanics_poles(theta), numerator_time(theta), w, h)
     y += 1e-8 * np.random.default_rng(0).standard_normal(w.size)
-    poles = vector_fit([Response(h, w, y, np.ones(w.size, dtype=bool), 1e-8)], 3)
+    poles = vector_fit(Response(h, w, y, np.ones(w.size, dtype=bool), 1e-8), 3)
     tone = poles[poles.imag > 0][0]
     assert abs(tone) == pytest.approx(6e-11**-0.5, rel=0.01)
     assert -2.0 * tone.real / abs(tone) ** 2 == pytest.approx(6e-6, rel=0.1)

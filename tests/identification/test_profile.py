@@ -13,9 +13,9 @@ from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile
 from psa_casadi.records import multisine, time_grid
-from psa_casadi.records.split import Experiment, whole
+from psa_casadi.records.split import whole
 from psa_casadi.report.plots.findings import profile_plot
-from psa_casadi.report.words.advice_words import profile_sentences
+from psa_casadi.report.words.notes import profile_sentences
 
 SIGMA = 2e-8
 #: The lags of wafers and bonding layers are far below the sampling: a tenth and less of it.
@@ -42,10 +42,10 @@ def coloured(seed: int, count: int) -> FloatArray:
 
 
 @cache
-def fitted(*free: str, noise: float = SIGMA) -> tuple[Fit, list[Experiment]]:
+def fitted(*free: str, noise: float = SIGMA) -> Fit:
     """Return a fit whose weights assume the noise SIGMA, whatever it is."""
     experiments = [whole(record_of(plant(), 1, noise))]
-    return fit(plant(), experiments, free, sigma=[SIGMA]), experiments
+    return fit(plant(), experiments, free, sigma=[SIGMA])
 
 
 def ends(p: Profile) -> tuple[float, float]:
@@ -57,9 +57,9 @@ def ends(p: Profile) -> tuple[float, float]:
 
 @pytest.mark.parametrize("name", ["k_L", "tau", "beta", "n"])
 def test_where_the_cost_is_quadratic_it_is_the_linearised_interval(name: str) -> None:
-    result, experiments = fitted("k_L", "A", "beta", "gamma", "n", "tau")
-    p = profile(result, experiments, name)
-    linear = determinacy(result, experiments).intervals[name]
+    result = fitted("k_L", "A", "beta", "gamma", "n", "tau")
+    p = profile(result, name)
+    linear = determinacy(result).intervals[name]
     (low, high), width = ends(p), linear.high - linear.low
     assert high - low == pytest.approx(width, rel=0.1)
     assert high + low == pytest.approx(linear.high + linear.low, abs=0.1 * width)
@@ -72,21 +72,23 @@ def test_residuals_above_the_weights_widen_it() -> None:
     """The weights say 2e-8 m, the residuals 6e-8 m: the interval is three times as wide."""
     widths = []
     for noise in (SIGMA, 3.0 * SIGMA):
-        result, experiments = fitted("k_L", "tau", noise=noise)
-        low, high = ends(profile(result, experiments, "tau"))
+        result = fitted("k_L", "tau", noise=noise)
+        low, high = ends(profile(result, "tau"))
         widths.append(high - low)
     assert widths[1] == pytest.approx(3.0 * widths[0], rel=0.1)
 
 
 def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
     """R_s C_p lies far below the sampling: an interval that no standard error describes."""
-    result, experiments = fitted("k_L", "tau", "R_s")
-    p = profile(result, experiments, "R_s")
+    result = fitted("k_L", "tau", "R_s")
+    p = profile(result, "R_s")
     assert p.high is not None
 
     def grown(value: float) -> float:
         model, starts = result.model.with_values({"R_s": value}), [result.start(0)]
-        held = fit(model, experiments, ("k_L", "tau"), sigma=result.sigma, start_states=starts)
+        held = fit(
+            model, result.experiments, ("k_L", "tau"), sigma=result.sigma, start_states=starts
+        )
         return held.cost - result.cost
 
     unit = grown(float(p.values[-1])) / p.increase[-1]
@@ -102,7 +104,7 @@ def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
     free = next(q.name for q in creep.parameters if q.name != creep.gain)
     experiments = [whole(record_of(plant(), 1))]
     result = fit(model, experiments, ("k_L", free), sigma=[SIGMA])
-    p = profile(result, experiments, free)
+    p = profile(result, free)
     assert p.low is None
     assert p.high is None
     assert p.increase.max() < 0.1
@@ -112,8 +114,8 @@ def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
 
 
 def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
-    result, experiments = fitted("k_L", "tau", "c_P")
-    p = profile(result, experiments, "c_P")
+    result = fitted("k_L", "tau", "c_P")
+    p = profile(result, "c_P")
     assert p.low is None
     assert p.high is not None
     assert p.high > 1e3
@@ -125,14 +127,14 @@ def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
 
 
 def test_a_fit_that_stopped_short_is_reported() -> None:
-    result, experiments = fitted("k_L", "tau")
+    result = fitted("k_L", "tau")
     theta = result.theta.copy()
-    error = determinacy(result, experiments).standard_errors["tau"]
+    error = determinacy(result).standard_errors["tau"]
     moved = result.model.values["tau"] + 1.5 * error
     theta[:2] = result.unknowns.coordinates({**result.model.values, "tau": moved})
     short = replace(result, theta=theta, model=result.model.with_values({"tau": moved}))
-    p = profile(short, experiments, "tau")
-    complete = profile(result, experiments, "tau")
+    p = profile(short, "tau")
+    complete = profile(result, "tau")
     assert len(profile_sentences(complete)) == 1
     assert "had not reached its minimum" in profile_sentences(p)[1]
     assert p.low == pytest.approx(complete.low, rel=2e-3)
@@ -140,14 +142,14 @@ def test_a_fit_that_stopped_short_is_reported() -> None:
 
 
 def test_a_parameter_that_was_not_searched_has_no_profile() -> None:
-    result, experiments = fitted("k_L", "tau")
+    result = fitted("k_L", "tau")
     with pytest.raises(psa.InputError, match=r"'m_P' was not searched in this fit.*k_L, tau"):
-        profile(result, experiments, "m_P")
+        profile(result, "m_P")
 
 
 def test_sentence_and_plot_show_profile_limit_and_interval() -> None:
-    result, experiments = fitted("k_L", "tau")
-    closed = profile(result, experiments, "tau")
+    result = fitted("k_L", "tau")
+    closed = profile(result, "tau")
     (sentence,) = profile_sentences(closed)
     assert sentence.startswith("tau lies between 2.")
     assert sentence.endswith("ms.")

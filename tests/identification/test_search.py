@@ -89,10 +89,7 @@ def identification() -> StackIdentification:
 def test_every_record_has_a_separate_noise_level() -> None:
     quiet, loud = with_noise(loops()[:1], 2e-3, 1)[0], loops()[1]
     result = identify([quiet, loud])
-    first, second = (
-        float(np.std(result.fit.residuals[result.fit.of_record(result.experiments, r)]))
-        for r in (0, 1)
-    )
+    first, second = (float(np.std(result.fit.residuals[result.fit.parts[r]])) for r in (0, 1))
     assert first > 1.5 * second
     assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 

@@ -35,7 +35,7 @@ def evident_model() -> psa.Model:
     start = psa.stack_model("demo")
     table = {n: 1.05 * start.values[n] for n in ("k_L", "A", "tau")}
     result = fit(start, experiments, list(table), sigma=[NOISE], start=table)
-    return diagnosed_model(result, experiments, result.predicted(experiments), False)
+    return diagnosed_model(result, result.predicted(), False)
 
 
 @cache

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.diagnosis.generic.attached import extended
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.evidence import Evidence
 from psa_casadi.model.model_file import dumps, loads

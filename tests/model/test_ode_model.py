@@ -210,6 +210,10 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "unknown symbol": (lambda: {"x": X, "ode": K * X}, {}, "'ode' uses the symbol 'k'"),
     "unknown symbol in y": (lambda: {"x": X, "ode": X, "y": K}, {}, "'y' uses the symbol 'k'"),
     "rows": (lambda: {"x": X, "ode": ca.vertcat(X, X)}, {}, "'x' has 1 row and 'ode' 2 rows"),
+    "another order": (
+        lambda: {"x": ca.vertcat(X, K), "ode": ca.vertcat(K, X)}, {"states": ["k", "x"]},
+        "declare them in the order of the symbols",
+    ),
     "matrix": (lambda: {"x": X, "ode": X, "y": ca.SX(2, 2) + X}, {}, "'y' is 2 by 2"),
     "both kinds": (lambda: {"x": X, "p": ca.MX.sym("k"), "ode": X}, {}, "mixes SX and MX"),
     "symbol twice": (lambda: {"x": X, "p": X, "ode": X}, {}, "'x' stands 2 times in x and p"),

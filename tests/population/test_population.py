@@ -17,8 +17,14 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.documents.files import identification_file
 from psa_casadi.documents.findings import finding_content
 from psa_casadi.model.model_file import dumps
-from psa_casadi.population.finding import Estimate, Finding, replayed
-from psa_casadi.population.population import differences, frequencies, population
+from psa_casadi.population.population import (
+    Estimate,
+    Finding,
+    differences,
+    frequencies,
+    population,
+    replayed,
+)
 from psa_casadi.population.statistics import adjusted, batch_test, drift, mixed_regression, outliers
 from psa_casadi.report.page.devices import MOST
 from psa_casadi.report.plots.device_plots import drift_plot, spread_plot

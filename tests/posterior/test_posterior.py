@@ -231,7 +231,7 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
     jsonschema.Draft202012Validator(json.loads(schema_texts()["posterior.schema.json"])).validate(
         content
     )
-    fitted = task().unknowns.values(task().theta)
+    fitted = task().unknowns.values(task().fit.theta)
     for name, f in content["parameters"].items():
         assert abs(f["mean"] - TRUTH.values[name]) < 4.0 * f["sd"], name
         # the posterior is nearly normal: its mean is the fit's, but for the chains' error
@@ -338,9 +338,9 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
 
 
 def test_what_a_user_model_does_not_take_is_refused() -> None:
-    with pytest.raises(psa.InputError, match="'hysteresis' is not among the words"):
+    with pytest.raises(psa.InputError, match="'hysteresis' is not among the arguments"):
         psa.sample(motor(), records(1), hysteresis="friction")
-    with pytest.raises(psa.InputError, match="'starts' is not among the words for"):
+    with pytest.raises(psa.InputError, match="'starts' is not among the arguments for"):
         psa.sample(psa.stack_model("demo"), "record.csv", starts=3)
     with pytest.raises(psa.InputError, match="'tau' was given, which is not sampled"):
         psa.sample(motor(), records(1), prior={"tau": 1.0})

@@ -17,8 +17,8 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.records import read_record
 from psa_casadi.records.read import apart
 from psa_casadi.records.read import table as tables
+from psa_casadi.records.read.choose import Request
 from psa_casadi.records.read.formats import READERS
-from psa_casadi.records.read.samples import Request
 from tests.mutations import sentences
 from tests.records.laboratory_bytes import hdf5, npy, npz, tdms, xlsx
 

@@ -368,7 +368,7 @@ def test_holds_show_the_noise_around_a_creep(correlation: float) -> None:
     result = holds(record(v, creep + noise(v.size, correlation)))
     assert_noise(result, correlation)
     assert result is not None
-    assert result.count == 4
+    assert result.holds == 4
 
 
 def test_ringing_after_a_step_is_no_noise_of_a_hold() -> None:

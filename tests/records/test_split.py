@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from psa_casadi.common.notes import texts
 from psa_casadi.common.units import BoolArray, FloatArray
-from psa_casadi.diagnosis.confirmation import coverage_notes
+from psa_casadi.diagnosis.held_out import coverage_notes
 from psa_casadi.records import Record
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise

@@ -50,6 +50,14 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
+def read_page(path: Path) -> tuple[str, Page]:
+    """Return the text of a page, which must load nothing, and what it holds."""
+    text = path.read_text("utf-8")
+    page = Page(text)
+    assert page.loaded == []
+    return text, page
+
+
 def figures(page: str) -> list[dict[str, Any]]:
     """Return the plotly figures of a page in their order."""
     holder = _ARRAYS.search(page)
@@ -73,5 +81,4 @@ def written(result: Any, folder: Path, **how: Any) -> tuple[str, Page]:
     """Return the page of a result, without a model that runs, and what it holds."""
     write = psa.write_fit_report if isinstance(result, psa.Identification) else psa.write_report
     write(result, folder / "page.html", still=True, **how)
-    text = (folder / "page.html").read_text(encoding="utf-8")
-    return text, Page(text)
+    return read_page(folder / "page.html")

@@ -76,11 +76,12 @@ def with_periodic(d: result.StackDiagnosis, *, counts: bool = False) -> result.S
                    base=(base,), extended=(y,))  # fmt: skip
 
 
-def _fit(model: psa.Model, records: int) -> Fit:
+def _fit(model: psa.Model, experiments: tuple[Experiment, ...]) -> Fit:
+    records = len(experiments)
     unknowns = unknowns_of(model, ("k_L", "tau"), [{}] * records, [0.0] * records, 1e-6)
     empty, levels = np.zeros((0, unknowns.size)), (NOISE,) * records
-    return Fit(model, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels, 0.0, True,
-               False, 1, Way(1e-6, 1e-6), (Simulated(EXACT, (0.0,)),))  # fmt: skip
+    return Fit(model, experiments, unknowns, np.zeros(unknowns.size), np.zeros(0), empty, levels,
+               0.0, True, False, 1, Way(1e-6, 1e-6), (Simulated(EXACT, (0.0,)),))  # fmt: skip
 
 
 def diagnosis(
@@ -89,7 +90,7 @@ def diagnosis(
     """Return a diagnosis with this verdict on the named records."""
     added = verdict in ADDED
     parts = [experiment(n, samples) for n in names]
-    base = tuple(p[1] for p in parts)
+    experiments, base = tuple(p[0] for p in parts), tuple(p[1] for p in parts)
     model = psa.compose((*psa.BASE, psa.EFFECTS["slow_creep"]) if added else psa.BASE)
     intervals = {"k_L": Interval(9.9, 10.1), "tau": Interval(1e-7, 1.0)}
     model = replace(model, provenance=Provenance(free=("k_L", "tau"), intervals=intervals))
@@ -127,9 +128,9 @@ def diagnosis(
         remaining=result.Remaining(verdict in ("adequate", "cause_named"), 0.4, "Nothing is left."),
         next_experiment=result.NextExperiment(None, (), ("Hold the voltage for a minute.",)),
         remarks=("Forces are assumed.",),
-        experiments=tuple(p[0] for p in parts),
-        base_fit=_fit(psa.compose(psa.BASE), len(names)),
-        extended_fit=_fit(model, len(names)),
+        experiments=experiments,
+        base_fit=_fit(psa.compose(psa.BASE), experiments),
+        extended_fit=_fit(model, experiments),
         base=base,
         extended=tuple(p[2] for p in parts) if added else base,
         model=model,
@@ -164,4 +165,5 @@ def long_fit(records: int, samples: int) -> tuple[StackIdentification, tuple[Ser
         curve = Curve("model", "#0072b2", model)
         held = np.zeros(samples, dtype=bool)
         rows.append(Series(record.name, time, voltage, measured, (curve,), held, NOISE, False))
-    return replace(identification(), experiments=tuple(experiments)), tuple(rows)
+    fit = replace(identification().fit, experiments=tuple(experiments))
+    return replace(identification(), fit=fit), tuple(rows)

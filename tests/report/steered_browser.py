@@ -3,7 +3,6 @@
 It speaks the DevTools protocol over two pipes, which needs no further package.
 """
 
-import base64
 import json
 import os
 import subprocess
@@ -40,9 +39,9 @@ class Steered:
 
     _session: dict[str, str] | None = None
 
-    def call(self, method: str, **given: Any) -> dict[str, Any]:
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
         self._count += 1
-        table = {"id": self._count, "method": method, "params": given, **(self._session or {})}
+        table = {"id": self._count, "method": method, "params": params, **(self._session or {})}
         os.write(self._write, json.dumps(table).encode() + b"\0")
         while True:
             output = self._next()
@@ -91,16 +90,6 @@ class Steered:
             more = {"text": text} if text and kind == "keyDown" else {}
             self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key,
                       windowsVirtualKeyCode=code, **more)  # fmt: skip
-
-    def look(self, path: Path, width: int, height: int, *, dark: bool = False) -> None:
-        """Save a picture of the page in a window of that size."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-                  deviceScaleFactor=1, mobile=width < 500)  # fmt: skip
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", features=[scheme])
-        time.sleep(0.6)
-        data = self.call("Page.captureScreenshot")["data"]
-        path.write_bytes(base64.b64decode(data))
 
 
 @contextmanager

@@ -14,7 +14,6 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.design.tracking.targets import respond
 from psa_casadi.identification.fitting.prediction import measured
-from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import loads
 from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.report.page import live
@@ -68,10 +67,20 @@ def moved(browser: Browser, page: Path) -> dict[str, Any]:
     return table
 
 
-def rms_in(text: str) -> float:
-    result = re.search(r"held-out samples: ([\d.e+-]+) (nm|µm) rms", text)
+def rms_in(text: str, before: str = "held-out samples: ") -> float:
+    """Return an error [nm] that a text states after some words."""
+    result = re.search(before + r"([\d.e+-]+) (nm|µm)", text)
     assert result is not None, text
     return float(result[1]) * (1e3 if result[2] == "µm" else 1.0)
+
+
+def texts_around(browser: Browser, page: Path, name: str, value: float) -> list[str]:
+    """Return what a page states before and after a parameter is set."""
+    texts: list[str] = driven(browser, page, f"""
+      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
+      box.psa.set('{name}', {value});
+      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    return texts
 
 
 @slow
@@ -100,9 +109,8 @@ def test_the_error_budget_follows(moved: dict[str, Any], case: psa.StackDiagnosi
         rms_of(case, {**values, **off}) ** 2 - noise**2 for off in ({}, {"creep_gain": 0.0})
     )
     name, size, share = moved["budget"]
-    number, unit = size.split()
     assert name == "slow creep"
-    assert float(number) * (1e3 if unit == "µm" else 1.0) == pytest.approx(without**0.5, rel=6e-3)
+    assert rms_in(size, "") == pytest.approx(without**0.5, rel=6e-3)
     removes = max(0.0, 100 * (1 - now / without))  # cut: at these values it adds error
     assert float(share.split("\u00a0")[0]) == pytest.approx(removes, abs=0.6)
     assert moved["cut"] == ["0\u00a0%", "75\u00a0%"]  # an effect that adds error removes nothing
@@ -122,15 +130,12 @@ def test_switches_numbers_and_reset_work(moved: dict[str, Any], case: psa.StackD
 
 
 @slow
-def test_an_effect_that_is_switched_off_is_explained_where_the_error_stands(
+def test_an_effect_that_is_switched_off_is_explained_at_the_error(
     browser: Browser, case: psa.StackDiagnosis, tmp_path: Path
 ) -> None:
     model = case.model.with_values({"creep_gain": 0.02})
     psa.write_report(replace(case, model=model), tmp_path / "on.html")
-    statement = driven(browser, tmp_path / "on.html", """
-      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
-      box.psa.set('creep_gain', 0);
-      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    statement = texts_around(browser, tmp_path / "on.html", "creep_gain", 0)
     assert "nothing is fitted again" not in statement[0]
     assert "With slow creep off nothing is fitted again: all other values were" in statement[1]
     e = case.experiments[0]
@@ -178,20 +183,15 @@ def test_a_designed_voltage_runs_in_its_page(browser: Browser, tmp_path: Path) -
     write_design_page(
         tmp_path / "d.html", title="A design", summary=["It moves."], live=played_again
     )
-    statement = driven(browser, tmp_path / "d.html", """
-      var box = document.querySelector('.live'), first = box.querySelector('output').textContent;
-      box.psa.set('k_L', 8);
-      tell([first, box.querySelector('output').textContent]);""")  # fmt: skip
+    statement = texts_around(browser, tmp_path / "d.html", "k_L", 8)
     assert statement[0].startswith("Off the path by 50 nm rms")
     changed = respond(model.with_values({"k_L": 8.0}), t, played.voltage).displacement
     off = 1e9 * float(np.sqrt(np.mean((path - changed) ** 2)))
-    result = re.search(r"by ([\d.]+) (nm|µm) rms", statement[1])
-    assert result is not None
-    assert float(result[1]) * (1e3 if result[2] == "µm" else 1.0) == pytest.approx(off, rel=6e-3)
+    assert rms_in(statement[1], "by ") == pytest.approx(off, rel=6e-3)
 
 
 @slow
-def test_without_compiler_a_page_says_so(
+def test_without_compiler_a_page_states_it(
     case: psa.StackDiagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("psa_casadi.export.web.has_zig", lambda: False)
@@ -232,29 +232,27 @@ def test_a_long_record_is_thinned_only_where_the_voltage_stays_the_same() -> Non
 
 
 @slow
-def test_a_model_of_ones_own_runs_in_its_page(
+def test_a_users_model_runs_in_its_page(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every output of a record and the model, at other values, as Python has them."""
     record = plants.motor(1, friction=0.0)
     result = psa.identify(own_models.motor(), record, starts=1)
     psa.write_fit_report(result, tmp_path / "page.html")
-    script = (
-        "var box = document.querySelector('.live'), list = box.querySelector('select');"
-        "function text() { return box.querySelector('output').textContent; }"
-        "var rows = Array.prototype.map.call(list.options, function (o) {"
-        "  list.value = o.value; list.dispatchEvent(new Event('change'));"
-        f"  box.psa.set('R', {1.1 * result.model.values['R']!r});"
-        "  return [o.textContent, text(), box.querySelector('figcaption').textContent]; });"
-        "tell(rows);"
-    )
-    rows = driven(browser, tmp_path / "page.html", script)
-    model = result.model.with_values({"R": 1.1 * result.model.values["R"]})
+    R = 1.1 * result.model.values["R"]
+    rows = driven(browser, tmp_path / "page.html", f"""
+      var box = document.querySelector('.live'), list = box.querySelector('select');
+      tell(Array.prototype.map.call(list.options, function (o) {{
+        list.value = o.value; list.dispatchEvent(new Event('change'));
+        box.psa.set('R', {R!r});
+        return ['output', 'figcaption'].map(n => box.querySelector(n).textContent);
+      }}));""")  # fmt: skip
+    model = result.model.with_values({"R": R})
     time, u = record.time - record.time[0], record.columns["voltage"][:, None]
     x0 = np.array([result.fit.start(0).get(s.name, 0.0) for s in model.structure.states])
     y = dict(zip(model.output_names, psa.run(model, time, u, x0).y.T, strict=True))
-    assert {row[2] for row in rows} == {"w over time", "i over time"}
-    for _, text, caption in rows:
+    assert {row[1] for row in rows} == {"w over time", "i over time"}
+    for text, caption in rows:
         name = caption.split()[0]
         output = re.search(r"^Error: ([\d.e+-]+) (m?)", text)
         assert output is not None, text
@@ -262,5 +260,5 @@ def test_a_model_of_ones_own_runs_in_its_page(
         assert float(output[1]) * (1e-3 if output[2] else 1.0) == pytest.approx(misfit, rel=6e-3)
     psa.write_fit_report(result, tmp_path / "still.html", still=True)
     assert "Change the model and see" not in (tmp_path / "still.html").read_text("utf-8")
-    monkeypatch.setattr(Model, "sampled_names", ("held",))
+    monkeypatch.setattr(psa.Model, "sampled_names", ("held",))
     assert "sampled states" in LiveModel(result.model, Future(), []).cure()

@@ -5,8 +5,6 @@ import re
 
 import pytest
 import yaml  # type: ignore[import-untyped]
-from typer.core import TyperGroup
-from typer.main import get_command
 
 import psa_casadi as psa
 from build_scripts import copied_pages, ports_page, python_page
@@ -16,30 +14,19 @@ from build_scripts.measured_data import ROOT
 from build_scripts.schemas import FILES, schema_texts
 from build_scripts.schemas_page import WRITTEN_BY
 from build_scripts.schemas_page import section as schema_section
-from psa_casadi.cli.app import app
 from psa_casadi.examples.index import examples
-
-
-def _options(group: TyperGroup, name: str) -> dict[str, list[str]]:
-    """Return the options of every command below a group."""
-    table: dict[str, list[str]] = {}
-    for word, command in group.commands.items():
-        if isinstance(command, TyperGroup):
-            table |= _options(command, f"{name} {word}")
-        else:
-            table[f"{name} {word}"] = [o for p in command.params for o in p.opts if o[:2] == "--"]
-    return table
+from tests.cli.test_cli import EVERY
 
 
 def test_the_page_of_commands_holds_every_command_and_option() -> None:
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
     parts = dict(part.split("`\n", 1) for part in commands().split("# `")[1:])
-    options = _options(group, "psa")
-    assert len(options) >= 15
-    for name, inputs in options.items():
-        lines = [line for line in parts[name].splitlines() if line.startswith("* `")]
-        assert [o for o in inputs if not any(o in line for line in lines)] == [], name
+    single = {path: c for path, c in EVERY.items() if not hasattr(c, "commands")}
+    assert len(single) >= 15
+    for path, command in single.items():
+        part = parts[" ".join(("psa", *path))].splitlines()
+        listed = "".join(line for line in part if line.startswith("* `"))
+        options = [o for p in command.params for o in p.opts if o.startswith("--")]
+        assert [o for o in options if o not in listed] == [], path
     assert "Example: `psa demo my_demo`" in parts["psa demo"]
 
 
@@ -48,7 +35,7 @@ def test_the_gallery_lists_every_effect() -> None:
     assert items == [f"[<code>{name}</code>](#{name})" for name in psa.EFFECTS]
 
 
-def test_an_effect_is_shown_with_equation_picture_source_and_parameters() -> None:
+def test_an_effect_has_equation_picture_source_and_parameters() -> None:
     effect = psa.EFFECTS["backlash"]
     text = section(effect)
     assert effect.equation_text.split(",  ", maxsplit=1)[0] in text

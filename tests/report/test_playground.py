@@ -114,7 +114,7 @@ def test_its_model_file_has_what_is_switched_on(played: dict[str, Any]) -> None:
 
 
 @slow
-def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) -> None:
+def test_voltage_effect_and_stack_change_the_text(played: dict[str, Any]) -> None:
     assert "add up to 0 nm" in played["plain"]
     items = [played[k] for k in ("plain", "effect", "other", "drawn")]
     assert len(set(items)) == 4
@@ -127,7 +127,7 @@ def test_voltage_effect_and_stack_change_what_is_said(played: dict[str, Any]) ->
 
 
 @slow
-def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_said(played: dict[str, Any]) -> None:
+def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_stated(played: dict[str, Any]) -> None:
     text = "The voltage reaches 900 V; P-885.51 is rated for 120 V."
     assert played["beyond"].startswith(text)
     assert played["within"]
@@ -147,7 +147,7 @@ def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> N
 
 
 @slow
-def test_the_command_plays_a_model_of_ones_own(tmp_path: Path) -> None:
+def test_the_command_plays_a_users_model(tmp_path: Path) -> None:
     model = psa.stack_model("PTBS200").with_effect(psa.EFFECTS["slow_creep"], {"creep_gain": 0.02})
     psa.save_model(model, tmp_path / "m.json")
     done("web", tmp_path / "m.json", "-o", tmp_path / "p.html", "--quiet")

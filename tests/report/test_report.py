@@ -15,7 +15,7 @@ from psa_casadi.export.check.check import CheckRow
 from psa_casadi.report.page import results
 from psa_casadi.report.plots.records import distribution_plot, time_plot
 from psa_casadi.report.words import colours, series
-from psa_casadi.report.words.fit_words import residual_sentence
+from psa_casadi.report.words.notes import residual_sentence
 from psa_casadi.report.words.phrases import Scale, number, probability_text
 from psa_casadi.report.words.tables import check_table
 from psa_casadi.report.words.text import check_sentence
@@ -74,9 +74,8 @@ def test_the_spectrum_of_white_noise_lies_on_the_noise_floor() -> None:
     (s,) = series.series_of(diagnosis("cause_named", samples=20_000))
     frequency, density = series.spectrum(s.time, s.residual(s.curves[1]))
     assert frequency[-1] == pytest.approx(500.0, rel=2e-3)
-    assert float(np.sqrt(np.mean(density[5:] ** 2))) == pytest.approx(
-        series.noise_density(s), rel=0.05
-    )
+    level = float(np.sqrt(np.mean(density[5:] ** 2)))
+    assert level == pytest.approx(series.noise_density(s), rel=0.05)
     assert series.noise_density(s) == pytest.approx(NOISE * np.sqrt(2e-3), rel=0.02)
 
 
@@ -217,7 +216,7 @@ def test_a_residual_is_called_what_it_is(
     assert figure != "lasting" or f"that of noise after {result.lasting:.2f} s" in sentence
 
 
-def test_a_residual_can_be_read_beside_one_that_is_far_off() -> None:
+def test_a_residual_is_readable_next_to_one_that_is_far_off() -> None:
     narrow, none = 1e-9 * white(5000), np.zeros(5000, dtype=bool)
     wide, time = 3e-8 * np.linspace(-1.0, 1.0, 5000), np.arange(5000) / 1000.0
     curves = (series.Curve("base", "#d55e00", -wide), series.Curve("extended", "#0072b2", -narrow))

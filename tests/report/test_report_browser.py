@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+import psa_casadi as psa
 from psa_casadi.identification.advice import Advice
-from psa_casadi.report.page.results import write_fit_report, write_report
 from tests.report.browser import DARK, PHONE, Browser, on_a_phone, seen_on_a_phone
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but
@@ -35,9 +35,9 @@ def report_page(kind: str, folder: Path) -> Path:
     path = folder / f"{kind}.html"
     if kind == "fit":
         result = replace(identification(), advice=(Advice("nothing", ("tau",), tried=12),))
-        write_fit_report(result, path, origin="synthetic")
+        psa.write_fit_report(result, path, origin="synthetic")
     else:
-        write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
+        psa.write_report(diagnosis("cause_named", ("rig_a", "rig_b")), path, origin="synthetic")
     return path
 
 
@@ -64,7 +64,7 @@ def test_every_plot_is_drawn_and_the_console_is_silent(browser: Browser, page: P
 
 
 @slow
-def test_a_still_picture_is_seen_where_scripts_are_off(
+def test_a_still_picture_is_visible_where_scripts_are_off(
     browser: Browser, of_diagnosis: Path
 ) -> None:
     off = of_diagnosis.with_name("off.html")

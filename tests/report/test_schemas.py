@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,33 +20,29 @@ from psa_casadi.identification.profile import Profile
 from psa_casadi.model.model_file import dumps
 from psa_casadi.model.ports import with_ports
 from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, tanks
+from tests.contract.helpers import DATA
 from tests.model.evidence_models import evident_model
 from tests.report.report_cases import diagnosis, identification, with_periodic
 
 
-def shipped(name: str) -> dict[str, Any]:
-    text = (files("psa_casadi") / "data" / "schemas" / f"{name}.schema.json").read_text("utf-8")
-    table: dict[str, Any] = json.loads(text)
-    return table
-
-
-def valid(name: str, text: str) -> dict[str, Any]:
-    """Return what a JSON text holds, which must match its shipped schema."""
+def valid(schema: str, text: str) -> dict[str, Any]:
+    """Return what a JSON text holds, which must match a schema that is shipped."""
     content: dict[str, Any] = json.loads(text)
-    jsonschema.Draft202012Validator(shipped(name)).validate(content)
+    rules = json.loads((DATA / "schemas" / f"{schema}.schema.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator(rules).validate(content)
     return content
 
 
-def test_what_is_shipped_is_what_the_records_say() -> None:
-    folder = files("psa_casadi") / "data" / "schemas"
-    kept = {entry.name: entry.read_text("utf-8") for entry in folder.iterdir()}
+def test_what_is_shipped_is_what_the_records_declare() -> None:
+    kept = {path.name: path.read_text("utf-8") for path in (DATA / "schemas").iterdir()}
     assert kept == schema_texts(), "accept with: python -m build_scripts.schemas"
-    for name in FILES:
-        jsonschema.Draft202012Validator.check_schema(shipped(name))
+    assert len(kept) == len(FILES)
+    for text in kept.values():
+        jsonschema.Draft202012Validator.check_schema(json.loads(text))
 
 
 @pytest.mark.parametrize("name", psa.STACKS)
-def test_model_files_are_as_their_schema_says(name: str) -> None:
+def test_model_files_match_their_schema(name: str) -> None:
     model = psa.stack_model(name).with_effect(psa.EFFECTS["slow_creep"])
     valid("model", dumps(model))
     published = replace(model, publication=psa.Publication(author="A", version="1"))
@@ -55,18 +50,18 @@ def test_model_files_are_as_their_schema_says(name: str) -> None:
 
 
 @pytest.mark.parametrize("make", [oscillator, motor, tanks, pair, cylinder, oven])
-def test_files_of_own_models_are_as_their_schema_says(make: Any) -> None:
+def test_files_of_users_models_match_their_schema(make: Any) -> None:
     content = valid("model", dumps(with_ports(make())))
     (item,) = content["own"].values()
     assert item["ports"]
 
 
-def test_the_evidence_of_a_model_is_as_its_schema_says() -> None:
+def test_the_evidence_of_a_model_matches_its_schema() -> None:
     assert "evidence" in valid("model", dumps(evident_model()))
 
 
 @pytest.mark.parametrize("verdict", ["adequate", "cause_named", "ambiguous", "unexplained"])
-def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
+def test_diagnoses_match_their_schema(verdict: Any) -> None:
     d = with_periodic(diagnosis(verdict))
     content = valid("diagnosis", d.to_json())
     assert content["misfit"][0]["views"]
@@ -79,7 +74,7 @@ def test_diagnoses_are_as_their_schema_says(verdict: Any) -> None:
     assert valid("diagnosis", replace(d, patch=patch, alternatives=(other,)).to_json())["patch"]
 
 
-def test_identifications_are_as_their_schema_says() -> None:
+def test_identifications_match_their_schema() -> None:
     fitted = identification()
     k = fitted.determinacy.names[0]
     profile = Profile(k, "N/m", "N/um", True, (0, 1), 1.0, 0.1, np.ones(2), np.ones(2), 0.9, None)
@@ -93,7 +88,7 @@ def test_identifications_are_as_their_schema_says() -> None:
     assert valid("identification", json_text(identification_file(fitted)))["profiles"] == {}
 
 
-def test_checks_are_as_their_schema_says() -> None:
+def test_checks_match_their_schema() -> None:
     rows = (CheckRow("trajectory", 1e-8, 1e-6, True, ""), stopped("calls", "it hung"))
     content = valid(
         "check", json_text(check_file(psa.CheckReport(Path("a.fmu"), rows, compared=False)))

@@ -354,7 +354,8 @@ def _side_by_side() -> list[FloatArray]:
         np.column_stack(columns)
         for columns in zip(*((start_on(m, t, u).x, m.state_nominals()) for m in sets), strict=True)
     )
-    return [exact.run_sets(model.structure, t, u, p=p, x0=x0, nominal=nominal, tolerance=1e-7)]
+    task = exact.Task(model.structure, "measured_displacement", t, u, np.zeros(len(t)), 1e-7)
+    return [exact.run_sets(task, exact.Numbers(p, x0, nominal))]
 
 
 def _stepped() -> list[FloatArray]:

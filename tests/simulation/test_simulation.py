@@ -7,7 +7,7 @@ from scipy.linalg import expm
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.start.ordinary import chosen_start
-from psa_casadi.model.components.stack import DRIVE
+from psa_casadi.model.components.stack import drive
 from psa_casadi.model.structure import structure_of
 from psa_casadi.model.variables import Provenance
 from psa_casadi.simulation.compiler import fingerprint, generate_c
@@ -99,7 +99,7 @@ def test_order_of_the_method_at_its_tolerances(
 
 def test_a_step_far_longer_than_the_drive_does_not_ring() -> None:
     """One step of 10^5 R_s C_p: L-stable methods forget the start, a trapezoid flips its sign."""
-    model = psa.compose((DRIVE,), {"R_s": 10.0, "C_p": 1e-6})
+    model = psa.compose((drive,), {"R_s": 10.0, "C_p": 1e-6})
     t = np.arange(4.0)
     steps = psa.run(model, t, np.zeros((4, 1)), np.array([100.0]), rtol=1e9)
     assert steps.steps == 3
@@ -171,7 +171,7 @@ def test_bad_samples_are_named() -> None:
     for words in ("do not strictly increase", "voltage has samples", "load_force has 1 samples"):
         assert words in str(caught.value)
     with pytest.raises(psa.InputError, match="no input 'load_force'"):
-        psa.simulate(psa.compose((DRIVE,)), [0.0, 1.0], [0.0, 1.0], load_force=[0.0, 0.0])
+        psa.simulate(psa.compose((drive,)), [0.0, 1.0], [0.0, 1.0], load_force=[0.0, 0.0])
     with pytest.raises(psa.InputError) as caught:
         psa.run(model, np.array([0.0, 1.0]), np.zeros((2, 1)), np.zeros(3), hold="cubic")
     for words in ("array u has the shape (2, 1)", "array x0", "hold 'cubic'"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from psa_casadi.cli.demo import HIDDEN
+from psa_casadi.report.words.catalogue import say
 from tests.studies.plants.base import (
     SUB_INTERVALS,
     Run,
@@ -180,8 +180,8 @@ def test_demo_fits_its_size(tmp_path: Path) -> None:
     truth = make_demo(tmp_path / "demo.csv")
     assert truth.effect == "slow_creep"
     assert (tmp_path / "demo.csv").stat().st_size < 300_000
-    assert f"{100 * truth.gain:.1f} % of the elongation for each decade" in HIDDEN
-    assert f"from {truth.parameters['t_0']:.2f} s on" in HIDDEN
+    assert f"{100 * truth.gain:.1f} % of the elongation for each decade" in say("demo.hidden")
+    assert f"from {truth.parameters['t_0']:.2f} s on" in say("demo.hidden")
 
 
 @pytest.mark.parametrize("kind", slow_but(["rich", "bipolar", "small"], EXCITATIONS))

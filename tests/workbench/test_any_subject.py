@@ -9,14 +9,12 @@ from pathlib import Path
 import numpy as np
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
-from psa_casadi.cli.own_model import Fitting, own_model
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.web import _subject
 from psa_casadi.cli.workbench.desk import Desk
 from psa_casadi.cli.workbench.server import served
 from tests.export.supplied import INFLOW, TIMES, lagged, level, supplied
-from tests.test_files import posix
-from tests.tiers import slow
+from tests.tiers import posix, slow
 from tests.workbench.test_workbench import Tab
 
 FREE = ["area=0.1:4", "outlet=0.001:0.01"]

@@ -15,14 +15,14 @@ from urllib.parse import quote
 
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.cli import web
 from psa_casadi.cli.inputs import Inputs
 from psa_casadi.cli.workbench.desk import Desk, Limits, stored_name
 from psa_casadi.cli.workbench.previews import Subject
 from psa_casadi.cli.workbench.run import Run
 from psa_casadi.cli.workbench.server import Server, served
-from psa_casadi.common.errors import InputError
-from tests.contract.test_commands import request
+from tests.contract.helpers import request
 from tests.model.test_ode_model import RIPPLE, install
 from tests.test_files import runs
 
@@ -83,16 +83,11 @@ class Tab:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def tab(tmp_path: Path) -> Iterator[Tab]:
     limits = Limits(one=5000, together=8000, files=3)
     desk = Desk(tmp_path, ["slow_creep"], limits=limits, module="tests.workbench.small_job")
-    with served(0, desk) as result:
-        yield result
-
-
-@pytest.fixture
-def tab(server: Server) -> Tab:
-    return Tab(server).enter()
+    with served(0, desk) as server:
+        yield Tab(server).enter()
 
 
 @pytest.mark.parametrize(
@@ -177,7 +172,7 @@ def test_a_second_tab_sees_the_same_run_and_starts_no_other(tab: Tab) -> None:
     assert tab.ask("GET", "/files/extended.fmu")[2] == b"PK"
 
 
-def test_a_stopped_run_keeps_what_it_has_and_can_begin_again(tab: Tab) -> None:
+def test_a_stopped_run_keeps_what_it_has_and_can_restart(tab: Tab) -> None:
     tab.give("a.csv", SMALL)
     tab.post("/start")
     tab.searched()
@@ -197,8 +192,7 @@ def test_a_run_ends_with_the_server(tmp_path: Path) -> None:
         tab.post("/start")
         tab.until("running")
         tab.searched()
-        job = desk.running()[0]
-        pid = job.pid
+        pid = desk.running()[0].pid
         assert pid is not None
         assert runs(pid)
     assert not runs(pid)
@@ -258,7 +252,7 @@ def test_what_arrives_takes_room(tmp_path: Path) -> None:
     class Slow(io.BytesIO):
         def read(self, size: int | None = -1, /) -> bytes:
             if self.tell():
-                with pytest.raises(InputError, match="with the other files"):
+                with pytest.raises(psa.InputError, match="with the other files"):
                     desk.add("second.csv", io.BytesIO(b"x" * 4000), 4000)
             return super().read(4500)
 
@@ -300,7 +294,7 @@ def test_a_fault_of_the_page_is_an_answer(tab: Tab, monkeypatch: pytest.MonkeyPa
     assert tab.post("/start") == 400
 
 
-def test_what_is_given_runs_in_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uploaded_files_run_in_no_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "desk"
     folder.mkdir()
     install(tmp_path / "site", "try:\n    import ruled\nexcept ImportError: pass\n" + RIPPLE)
@@ -325,14 +319,14 @@ def test_commands_of_the_page_look_for_modules_where_they_were_named_only(
 
     def no_server(port: int, desk: Desk) -> None:
         there.append([*sys.path])
-        raise InputError("no server")
+        raise psa.InputError("no server")
 
     monkeypatch.setattr("psa_casadi.cli.workbench.server.served", no_server)
     (tmp_path / "gratings.py").write_text(RIPPLE)
     for first in ("", str(tmp_path)):
         for modules in ([], ["gratings"]):
             monkeypatch.setattr(sys, "path", [first, *sys.path])
-            with pytest.raises(InputError, match="no server"):
+            with pytest.raises(psa.InputError, match="no server"):
                 web._serve(0, True, Subject(), Inputs(effects=modules))
             here = [k for k, p in enumerate(there[-1], 1) if p in ("", str(tmp_path))]
             assert here == ([len(there[-1])] if modules else [])

@@ -1,53 +1,27 @@
 """The local page in use: choose a record, map its columns, read the verdict."""
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
 
+from tests.contract.helpers import served
 from tests.report.browser import find_browser
 from tests.report.steered_browser import Steered, steered
-from tests.tiers import slow
+from tests.tiers import posix, slow
 
 pytestmark = pytest.mark.xdist_group("browser")
 DEMO = Path(__file__).parents[2] / "psa_casadi" / "data" / "demo.csv"
 #: A name that is markup where somebody takes it for that.
 HOSTILE = "<img src=x onerror=document.title=1>.csv"
-PICTURES = os.environ.get("PSA_CASADI_PICTURES", "")
 
 
 @pytest.fixture
 def address(tmp_path: Path) -> Iterator[str]:
-    command = [sys.executable, "-m", "psa_casadi.cli", "web", "--diagnose", "--no-browser"]
     (tmp_path / "tmp").mkdir()
-    table = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
-    process = subprocess.Popen(
-        command, env=table, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    yield process.stdout.readline().split()[1]
-    process.send_signal(signal.SIGINT)
-    statement = process.communicate(timeout=20)[1]
-    assert process.returncode == 0, statement
-    assert "Ended" in statement
-    assert not list((tmp_path / "tmp").iterdir())
-
-
-def picture(tab: Steered, name: str, width: int = 1100, height: int = 1500, **how: bool) -> None:
-    if PICTURES:
-        tab.look(Path(PICTURES) / f"{name}.png", width, height, **how)
-
-
-def pictures_of_the_result(tab: Steered) -> None:
-    """Save the page as it is: all of it, on a phone, at night."""
-    picture(tab, "result", height=3000)
-    picture(tab, "phone", 390, 2600)
-    picture(tab, "night", height=2200, dark=True)
+    with served(tmp_path / "tmp") as (place, token):
+        yield f"http://{place}/?token={token}"
 
 
 def drop(tab: Steered, path: Path) -> None:
@@ -94,7 +68,6 @@ def of_another_layout(tab: Steered, path: Path, line: str) -> None:
     statement = "time=time:s", "voltage=voltage:V", "displacement=pos:um"
     both = ",".join([line, *(f"{path.name}@{part}" for part in statement)])
     assert tab.run("document.querySelector('#set-columns').value") == both
-    picture(tab, "layouts")
     tab.run(f"document.querySelector('[aria-label=\"Remove {path.name}\"]').click()")
     tab.until(f"document.querySelector('#set-columns').value === '{line}'")
 
@@ -111,7 +84,7 @@ def nothing_outside_nor_wrong(tab: Steered, address: str) -> None:
 
 
 @slow
-@pytest.mark.skipif(sys.platform == "win32", reason="pipes with numbers of POSIX")
+@posix
 def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) -> None:
     record = tmp_path / HOSTILE
     record.write_text(DEMO.read_text("utf-8").replace("displacement [um]", "CH2"), "utf-8")
@@ -130,11 +103,9 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         assert tab.run("document.querySelector('#set-columns').value") == line
         of_another_layout(tab, tmp_path / "b.csv", line)
         assert faults(tab, axe) == []
-        picture(tab, "files")
         tab.run("document.querySelector('#start').focus()")
         tab.press("Enter", 13, "\r")
         tab.until("document.querySelectorAll('#tree li').length > 2", 120)
-        picture(tab, "search")
         tab.call("Page.navigate", url=address)  # a tab that is opened anew sees the same run
         tab.until("document.querySelectorAll('#tree li').length > 2")
         tab.until("!document.querySelector('#result').hidden", 240)
@@ -147,7 +118,6 @@ def test_a_record_is_dropped_and_its_verdict_read(address: str, tmp_path: Path) 
         assert tab.run("document.title") == "Diagnose records"
         assert not tab.run("document.querySelector('img:not(.still)')")
         assert faults(tab, axe) == []
-        pictures_of_the_result(tab)
         narrow(tab)
         report_runs(tab, address)
         nothing_outside_nor_wrong(tab, address)

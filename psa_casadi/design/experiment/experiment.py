@@ -1,6 +1,5 @@
 """The next experiment: best for chosen parameters, or for separating effects."""
 
-import math
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,10 +30,11 @@ from psa_casadi.design.experiment.search import BRIEF, GRID, Effort, Make, coars
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.screening import temperature
-from psa_casadi.diagnosis.search.steps import one_of_each
+from psa_casadi.diagnosis.search.state import one_of_each
 from psa_casadi.diagnosis.task import FAST, LIMITS
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
+from psa_casadi.model.variables import Interval
 from psa_casadi.records.excitation import sine, triangle
 from psa_casadi.records.record import Record
 from psa_casadi.records.signals import Signals
@@ -193,7 +193,6 @@ _APART = 1.618
 ORDINARY = 2.5
 #: Samples of the grid on which the result is judged, at most.
 _FINE = 2000
-_SURE = 1.959964
 #: Rivals that a record is designed for, at most: as many as a verdict lists.
 _RIVALS = 5
 
@@ -409,7 +408,7 @@ def resolving_experiment(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
             " nothing to tell apart; name the effects with --separate instead."
         )
-    contenders, _ = one_of_each(d.contenders, d.experiments)
+    contenders, _ = one_of_each(d.contenders)
     if len(contenders) < 2 or (limits is not None and not _slow(limits)):
         contenders = d.contenders  # a new record that shows resonances may separate them
     contenders = tuple(sorted(contenders, key=lambda c: -c.evidence)[:_RIVALS])
@@ -442,10 +441,7 @@ def _intervals(rival: Rival, errors: Mapping[str, float]) -> dict[str, tuple[flo
     """Return 95 % intervals as those of a fit, of which nothing lies outside the bounds."""
     intervals = {}
     for name, error in errors.items():
-        value, half, p = rival.model.values[name], _SURE * error, rival.model.parameter(name)
-        low, high = value - half, value + half
-        if p.log and value > 0.0:
-            factor = math.exp(min(half / value, 50.0))
-            low, high = value / factor, value * factor
+        value, p = rival.model.values[name], rival.model.parameter(name)
+        low, high = Interval.of(p, value, error)
         intervals[name] = max(low, min(p.bounds[0], value)), min(high, max(p.bounds[1], value))
     return intervals

@@ -29,11 +29,10 @@ from psa_casadi.design.experiment.experiment import (
 )
 from psa_casadi.design.experiment.limits import KINDS, Kind, Limits
 from psa_casadi.design.experiment.search import Effort
-from psa_casadi.diagnosis.generic.attached import Attached, extended, of_ones_own
-from psa_casadi.diagnosis.generic.of_rates import effects_of
+from psa_casadi.diagnosis.generic import Attached, effects_of, extended, of_ones_own
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.result import Contender
-from psa_casadi.diagnosis.search.steps import fit_contenders, fitted_rivals
+from psa_casadi.diagnosis.search.state import fit_contenders, fitted_rivals
 from psa_casadi.identification.experiments import experiments_of, given_to
 from psa_casadi.identification.fitting.fit import Fit
 from psa_casadi.identification.multistart import free_of, known_zeros, search_starts
@@ -201,7 +200,8 @@ def rivals_of(
             known_start=known_start,
         )  # fmt: skip
         progress("fitting from several starts")
-        base, runs, _ = search_starts(sized(model, runs), runs, names, starts=8)
+        base, _ = search_starts(sized(model, runs), runs, names, starts=8)
+        runs = base.experiments
         words["outputs"] = tuple(c.column for c in base.channels)
     if not separate:
         if base is None:
@@ -215,7 +215,7 @@ def rivals_of(
         ], None, None  # fmt: skip
     opened = replace(base, model=with_ports(base.model))
     components = tuple(e.component for e in effects)
-    task = Task(runs, components, Pack(), progress=progress)
+    task = Task(components, Pack(), progress=progress)
     return _fitted(base, fitted_rivals(opened, task), words)
 
 
@@ -234,7 +234,7 @@ def _of_a_stack(
         return [rival_of_model(model.name, model, names)], None, None
     effects = [EFFECTS[e] if isinstance(e, str) else e for e in separate]
     if records is not None:
-        base, contenders, _ = fit_contenders(records, effects, model=model, progress=progress)
+        base, contenders = fit_contenders(records, effects, model=model, progress=progress)
         return _fitted(base, contenders, {})
     plain = model.without(e.name for e in effects)
     free = [n for n in free if n in plain.parameter_names]

@@ -38,9 +38,9 @@ from psa_casadi.design.mechanism.loop import (
     stroke_loss,
 )
 from psa_casadi.model.components.surroundings import (
-    PRESTRESS_MECHANISM,
     PRESTRESS_MOUNTS,
-    PRESTRESS_PORT,
+    prestress_mechanism,
+    prestress_port,
 )
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.variables import Provenance
@@ -49,11 +49,8 @@ from psa_casadi.model.variables import Provenance
 def product(a: Any, b: Any) -> Any:
     """Product of two polynomials in CasADi, highest power first."""
     a, b = ca.vertcat(a), ca.vertcat(b)
-    terms = [0.0] * (a.numel() + b.numel() - 1)
-    for i in range(a.numel()):
-        for k in range(b.numel()):
-            terms[i + k] = terms[i + k] + a[i] * b[k]
-    return ca.vertcat(*terms)
+    last = a.numel() - 1
+    return sum(ca.vertcat(*[0.0] * i, a[i] * b, *[0.0] * (last - i)) for i in range(last + 1))
 
 
 def total(a: Any, b: Any) -> Any:
@@ -101,12 +98,68 @@ class Limits:
 
 @dataclass(frozen=True)
 class Wish:
-    """What is wanted, SI: least damping ratio, least bandwidth [Hz], or poles [rad/s]; limits."""
+    """What is wanted, SI: least damping ratio, least bandwidth [Hz], or poles [rad/s]; limits.
+
+    `starts` are those of the search. Raises an InputError that names everything that makes no
+    sense.
+    """
 
     damping: float | None
     bandwidth: float | None
-    poles: tuple[complex, ...]
+    poles: Sequence[complex]
     limits: Limits
+    starts: int
+
+    def __post_init__(self) -> None:
+        problems, damping, width = Problems(), self.damping, self.bandwidth
+        if self.poles and (damping is not None or width is not None):
+            problems.add(
+                "Poles are wanted together with a damping or a bandwidth; leave one of them out."
+            )
+        if not self.poles and damping is None and width is None:
+            problems.add("Nothing is wanted; give a damping ratio, a bandwidth in Hz, or poles.")
+        if damping is not None and not 0.0 < damping <= 1.0:
+            problems.add(f"The damping ratio {damping:g} is not in (0, 1]; 0.7 is usual.")
+        if width is not None and not 0.0 < width < inf:
+            problems.add(f"The bandwidth {width:g} Hz is not positive; give it in Hz.")
+        _check_poles(self.poles, problems)
+        _check_limits(self.limits, problems)
+        if self.starts < 1:
+            problems.add(f"{self.starts} starts find nothing; give 1 or more.")
+        problems.raise_if_any()
+
+
+def _check_poles(poles: Sequence[complex], problems: Problems) -> None:
+    if not all(isfinite(p.real) and isfinite(p.imag) and p.real < 0.0 for p in poles):
+        problems.add("A wanted pole has no negative real part; a mounted stack must be stable.")
+    for p in poles:
+        if p.imag and not any(abs(q - p.conjugate()) < 1e-9 * abs(p) for q in poles):
+            problems.add(f"The wanted pole {p:.5g} comes without its conjugate; add it.")
+    if len(poles) not in (0, 2, 4):
+        problems.add(
+            f"{len(poles)} poles are wanted; give one or two pairs: two or four poles in rad/s."
+        )
+    elif sum(p.imag == 0.0 for p in poles) % 2:
+        problems.add("A real pole is wanted alone; real poles come in pairs too.")
+
+
+def _check_limits(limits: Limits, problems: Problems) -> None:
+    if not 0.0 <= limits.stroke_loss < 1.0:
+        problems.add(
+            f"The largest stroke loss is {limits.stroke_loss:g}; give a share of the stroke from 0"
+            " up to, not including, 1."
+        )
+    if limits.force is not None and not 0.0 < limits.force < inf:
+        problems.add(
+            f"The largest force is {limits.force:g} N; give a positive one, or leave it out."
+        )
+    ranges = {"mass": (*limits.mass, "kg"), "damping": (*limits.damping, "N.s/m")}
+    for what, (low, high, unit) in ranges.items():
+        if not 0.0 <= low < high < inf:
+            problems.add(
+                f"The {what} may lie between {low:g} and {high:g} {unit}, which is no range; give"
+                " a least value of 0 or more and a larger one."
+            )
 
 
 @dataclass(frozen=True)
@@ -118,14 +171,14 @@ class Candidate:
     converged: bool
 
 
-def search(mechanics: Mechanics, wish: Wish, starts: int, seed: int = 0) -> list[Candidate]:
+def search(mechanics: Mechanics, wish: Wish) -> list[Candidate]:
     """Search from several starts, and return what each led to, best first."""
-    draw = np.random.default_rng(seed)
+    draw = np.random.default_rng(0)
     count, candidates = (len(mechanics.denominator) - 1) // 2, []
     # which pair of the stack's poles each wanted pair may become
     for order in permutations(range(count), len(pairs_of(wish.poles))):
         problem = _Problem(mechanics, wish, order)
-        candidates += [problem.solve(draw) for _ in range(starts)]
+        candidates += [problem.solve(draw) for _ in range(wish.starts)]
     return sorted(candidates, key=lambda c: (not c.converged, c.cost))
 
 
@@ -265,62 +318,6 @@ def pairs_of(poles: Iterable[complex]) -> list[tuple[float, float]]:
     return [(w, float(both) / (2.0 * w)) for w, both in pairs]
 
 
-def check_goals(
-    damping: float | None, width: float | None, poles: Sequence[complex], limits: Limits,
-    starts: int,
-) -> None:  # fmt: skip
-    """Raise an InputError that names every goal and limit that makes no sense."""
-    problems = Problems()
-    if poles and (damping is not None or width is not None):
-        problems.add(
-            "Poles are wanted together with a damping or a bandwidth; leave one of them out."
-        )
-    if not poles and damping is None and width is None:
-        problems.add("Nothing is wanted; give a damping ratio, a bandwidth in Hz, or poles.")
-    if damping is not None and not 0.0 < damping <= 1.0:
-        problems.add(f"The damping ratio {damping:g} is not in (0, 1]; 0.7 is usual.")
-    if width is not None and not 0.0 < width < inf:
-        problems.add(f"The bandwidth {width:g} Hz is not positive; give it in Hz.")
-    _check_poles(poles, problems)
-    _check_limits(limits, problems)
-    if starts < 1:
-        problems.add(f"{starts} starts find nothing; give 1 or more.")
-    problems.raise_if_any()
-
-
-def _check_poles(poles: Sequence[complex], problems: Problems) -> None:
-    if not all(isfinite(p.real) and isfinite(p.imag) and p.real < 0.0 for p in poles):
-        problems.add("A wanted pole has no negative real part; a mounted stack must be stable.")
-    for p in poles:
-        if p.imag and not any(abs(q - p.conjugate()) < 1e-9 * abs(p) for q in poles):
-            problems.add(f"The wanted pole {p:.5g} comes without its conjugate; add it.")
-    if len(poles) not in (0, 2, 4):
-        problems.add(
-            f"{len(poles)} poles are wanted; give one or two pairs: two or four poles in rad/s."
-        )
-    elif sum(p.imag == 0.0 for p in poles) % 2:
-        problems.add("A real pole is wanted alone; real poles come in pairs too.")
-
-
-def _check_limits(limits: Limits, problems: Problems) -> None:
-    if not 0.0 <= limits.stroke_loss < 1.0:
-        problems.add(
-            f"The largest stroke loss is {limits.stroke_loss:g}; give a share of the stroke from 0"
-            " up to, not including, 1."
-        )
-    if limits.force is not None and not 0.0 < limits.force < inf:
-        problems.add(
-            f"The largest force is {limits.force:g} N; give a positive one, or leave it out."
-        )
-    ranges = {"mass": (*limits.mass, "kg"), "damping": (*limits.damping, "N.s/m")}
-    for what, (low, high, unit) in ranges.items():
-        if not 0.0 <= low < high < inf:
-            problems.add(
-                f"The {what} may lie between {low:g} and {high:g} {unit}, which is no range; give"
-                " a least value of 0 or more and a larger one."
-            )
-
-
 _LIMITS = Limits()
 #: A goal counts as reached if the shortfall is less than this share.
 _REACHED = 1e-3
@@ -392,9 +389,8 @@ def design_mechanism(
     Raises InputError for goals or limits that make no sense; a goal out of reach is no error, the
     design then comes as near as the limits allow and `attained` is False.
     """
-    check_goals(damping, bandwidth, poles, limits, starts)
-    mechanics = mechanics_of(model, acts_on)
-    searches = search(mechanics, Wish(damping, bandwidth, tuple(poles), limits), starts)
+    wish, mechanics = Wish(damping, bandwidth, poles, limits, starts), mechanics_of(model, acts_on)
+    searches = search(mechanics, wish)
     best = searches[0]
     if not best.converged:
         raise InputError(
@@ -433,13 +429,13 @@ def mechanism_model(design: MechanismDesign, name: str = "mechanism") -> Model:
         f"The lag's pole at {design.lag_pole:.5g} rad/s stays where it is.",
     )
     values = {"m_m": m.mass, "c_m": m.damping, "k_m": m.stiffness}
-    model = compose([PRESTRESS_MECHANISM], values, name=name, description="prestress mechanism")
+    model = compose([prestress_mechanism], values, name=name, description="prestress mechanism")
     return model.with_values({}, provenance=Provenance(notes=notes))
 
 
 def port_model(model: Model) -> Model:
     """Return a stack with the port for a mechanism's force and the motion of its tip."""
-    return model.with_components((*model.plant().components, PRESTRESS_PORT))
+    return model.with_components((*model.plant().components, prestress_port))
 
 
 def mounted_model(model: Model, design: MechanismDesign) -> Model:

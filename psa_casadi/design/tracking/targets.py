@@ -12,7 +12,7 @@ from psa_casadi.common.units import BoolArray, FloatArray, parse_unit, to_si
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import runs_of
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.samples import Request
+from psa_casadi.records.read.choose import Request
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import linear_part, start_state
 from psa_casadi.simulation.stepper import run

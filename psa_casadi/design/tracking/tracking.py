@@ -150,25 +150,6 @@ class NoSolutionError(PsaError):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """The task: instants (n,) [s], range of the path [m], voltage at rest and its scale [V].
-
-    `start` (nx,) is the state before the first sample, over nominal. The voltage stays at `rest`
-    over the first interval, so that every simulator starts at rest. `minimax` asks for the least
-    largest error instead of the least mean square.
-    """
-
-    interval: Interval
-    time: FloatArray
-    span: float
-    rest: float
-    scale: float
-    start: FloatArray
-    limits: AmplifierLimits
-    minimax: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class Solution:
     """Voltage (n,) [V], states over nominal (2 nx, N) and displacement (2, N) [m] at the nodes.
 
@@ -183,24 +164,38 @@ class Solution:
     converged: bool
 
 
+@dataclass(eq=False)
 class Program:
-    """A problem set up once and solved for paths that may change from solve to solve."""
+    """A program set up once and solved for paths that may change from solve to solve.
 
-    def __init__(self, problem: Problem) -> None:
-        self.problem = problem
-        count, nx = len(problem.time) - 1, len(problem.start)
+    `time` (n,) [s], the `span` of the path [m], the voltage at `rest` and its `scale` [V]; `start`
+    (nx,) is the state before the first sample, over nominal. The voltage stays at `rest` over the
+    first interval, so that every simulator starts at rest. `minimax` asks for the least largest
+    error instead of the least mean square.
+    """
+
+    interval: Interval
+    time: FloatArray
+    span: float
+    rest: float
+    scale: float
+    start: FloatArray
+    limits: AmplifierLimits
+    minimax: bool = False
+
+    def __post_init__(self) -> None:
+        count, nx = len(self.time) - 1, len(self.start)
         size = 2 * nx * count
-        self._x = ca.MX.sym("x", size + count - 1 + int(problem.minimax))
+        self._x = ca.MX.sym("x", size + count - 1 + int(self.minimax))
         self._path = ca.MX.sym("path", 2 * count)
         inner = ca.reshape(self._x[:size], 2 * nx, count)
-        first = ca.DM([[problem.rest, problem.rest]])
         free = self._x[size : size + count - 1]
-        self._voltage = ca.horzcat(first, (problem.scale * free).T)
-        clock = np.vstack([problem.time[:-1], np.diff(problem.time)])
+        self._voltage = ca.horzcat(ca.DM([[self.rest, self.rest]]), (self.scale * free).T)
+        clock = np.vstack([self.time[:-1], np.diff(self.time)])
         residual, displacement, current = chain(
-            problem.interval, problem.start, inner, self._voltage, clock
+            self.interval, self.start, inner, self._voltage, clock
         )
-        self._errors = (ca.vec(displacement) - self._path) / problem.span
+        self._errors = (ca.vec(displacement) - self._path) / self.span
         rows, self._low, self._high = self._constraints(residual, current, clock[1])
         self._solver = self._build(rows)
         self._outputs = ca.Function("outputs", [self._x], [displacement])
@@ -210,12 +205,12 @@ class Program:
 
         Raises NoSolutionError if IPOPT finds none.
         """
-        q = self.problem
-        guess = [inner.T.ravel(), voltage[2:] / q.scale, np.full(int(q.minimax), 1e-2)]
+        guess = [inner.T.ravel(), voltage[2:] / self.scale, np.full(int(self.minimax), 1e-2)]
         low = np.full(self._x.shape[0], -np.inf)
         high = -low
         free = slice(inner.size, inner.size + len(voltage) - 2)
-        low[free], high[free] = q.limits.min_voltage / q.scale, q.limits.max_voltage / q.scale
+        low[free] = self.limits.min_voltage / self.scale
+        high[free] = self.limits.max_voltage / self.scale
         solution = self._solver(
             x0=np.concatenate(guess), p=path.T.ravel(), lbx=low, ubx=high,
             lbg=self._low, ubg=self._high,
@@ -230,7 +225,7 @@ class Program:
                 " the limits or slow the path down."
             )
         x = np.array(solution["x"]).ravel()
-        designed = np.concatenate([[q.rest, q.rest], q.scale * x[free]])
+        designed = np.concatenate([[self.rest, self.rest], self.scale * x[free]])
         states = x[: inner.size].reshape(inner.T.shape).T
         displacement, count = np.array(self._outputs(solution["x"])), int(stats["iter_count"])
         return Solution(designed, states, displacement, count, bool(stats["success"]))
@@ -239,18 +234,17 @@ class Program:
         self, residual: Expression, current: Expression, lengths: FloatArray
     ) -> tuple[Expression, FloatArray, FloatArray]:
         """Return rows with their bounds: equations, rate, current, and the largest error."""
-        q = self.problem
         rows: list[Any] = [ca.vec(residual)]
         least, most = [0.0], [0.0]
-        if np.isfinite(q.limits.max_rate):
+        if np.isfinite(self.limits.max_rate):
             change: Expression = ca.diff(self._voltage, 1, 1)[1:].T
-            rows.append(change / (q.limits.max_rate * lengths[1:]))
-        if np.isfinite(q.limits.max_current):
+            rows.append(change / (self.limits.max_rate * lengths[1:]))
+        if np.isfinite(self.limits.max_current):
             passed: Expression = ca.vec(current)
-            rows.append(passed / q.limits.max_current)
+            rows.append(passed / self.limits.max_current)
         least += [-1.0] * (len(rows) - 1)
         most += [1.0] * (len(rows) - 1)
-        if q.minimax:
+        if self.minimax:
             rows += [self._errors - self._x[-1], -self._errors - self._x[-1]]
             least, most = [*least, -np.inf, -np.inf], [*most, 0.0, 0.0]
         sizes = [row.shape[0] for row in rows]
@@ -263,9 +257,8 @@ class Program:
         Lagrangian's where the error vanishes, without second derivatives of the equations, which an
         imported FMU does not have. Elsewhere it is the exact one, of equations that are symbolic.
         """
-        q = self.problem
-        bends: Expression = PRICE * ca.diff(self._voltage, 2, 1).T / q.scale
-        share = _REST if q.minimax else 1.0
+        bends: Expression = PRICE * ca.diff(self._voltage, 2, 1).T / self.scale
+        share = _REST if self.minimax else 1.0
         errors = self._errors * np.sqrt(share / self._errors.shape[0])
         terms = ca.vertcat(errors, bends / np.sqrt(bends.shape[0]))
         cost = WEIGHT * ca.sumsqr(terms)
@@ -274,13 +267,14 @@ class Program:
         multipliers = ca.MX.sym("multipliers", rows.shape[0])
         hessian = ca.triu(2.0 * WEIGHT * sigma * slopes.T @ slopes)
         arguments = [self._x, self._path, sigma, multipliers]
-        limited = q.minimax or q.limits != AmplifierLimits()  # not only squares shape the answer
+        # whether not only squares shape the answer
+        limited = self.minimax or self.limits != AmplifierLimits()
         barrier = _BARRIER_LIMITED if limited else _BARRIER
         ipopt = {"print_level": 0, "sb": "yes", "tol": 1e-8, "max_iter": 150, "mu_init": barrier}
         options: dict[str, Any] = {"print_time": False, "ipopt": ipopt}
-        if not (limited and q.interval.symbolic):
+        if not (limited and self.interval.symbolic):
             options["hess_lag"] = ca.Function("hessian", arguments, [hessian])
-        goal = cost + self._x[-1] * 100.0 if q.minimax else cost
+        goal = cost + self._x[-1] * 100.0 if self.minimax else cost
         program = {"x": self._x, "p": self._path, "f": goal, "g": rows}
         return ca.nlpsol("tracking", "ipopt", program, options)
 
@@ -354,11 +348,11 @@ def track(
     width = WIDTH * float(np.max(np.abs(inverse.response.rate)))
     smooth = smooth_form(model, width)
     interval = interval_of((equations or dynamics_of)(smooth), symbolic=equations is None)
-    problem = Problem(
+    program = Program(
         interval, target.time, target.span, rest, float(np.ptp(inverse.response.voltage)),
         start / interval.nominal, bounds, minimax,
     )  # fmt: skip
-    solutions = _solve(model, smooth, target, problem, guess, corrections, progress)
+    solutions = _solve(model, smooth, target, program, guess, corrections, progress)
     designed = _chosen(model, target, bounds, minimax, solutions, cut)
     return TrackedInput(
         target, bounds, minimax, *designed, width, inverse,
@@ -406,7 +400,7 @@ def _rest(model: Model, target: Target, limits: AmplifierLimits) -> tuple[float,
 
 
 def _solve(
-    model: Model, smooth: Model, target: Target, problem: Problem, guess: FloatArray,
+    model: Model, smooth: Model, target: Target, program: Program, guess: FloatArray,
     corrections: int, progress: Callable[[str], None],
 ) -> list[tuple[float, Solution]]:  # fmt: skip
     """Return every solution with its error by the full simulator [m], rms or largest.
@@ -415,8 +409,7 @@ def _solve(
     """
     between = scipy.interpolate.PchipInterpolator(target.time, target.displacement)
     path = np.asarray(between(_nodes(target.time)))
-    start = problem.start * problem.interval.nominal
-    program, wanted = Program(problem), path
+    start, wanted = program.start * program.interval.nominal, path
     inner, _ = _at_nodes(smooth, target.time, guess, start)
     solutions: list[tuple[float, Solution]] = []
     for count in range(corrections + 1):
@@ -427,7 +420,7 @@ def _solve(
             break
         _, reached = _at_nodes(model, target.time, solution.voltage, start)
         off = np.abs(reached - path)
-        size = np.max(off) if problem.minimax else np.sqrt(np.mean(off**2))
+        size = np.max(off) if program.minimax else np.sqrt(np.mean(off**2))
         solutions.append((float(size), solution))
         guess, inner = solution.voltage, solution.inner
         wanted = path - (reached - solution.displacement)

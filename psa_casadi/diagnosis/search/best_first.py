@@ -12,13 +12,13 @@ import numpy as np
 from psa_casadi.common.notes import note
 from psa_casadi.diagnosis import base_fit
 from psa_casadi.diagnosis.colour import noise_rms
-from psa_casadi.diagnosis.families import CauseEvidence
+from psa_casadi.diagnosis.corrections import CauseEvidence
 from psa_casadi.diagnosis.pack import Task
 from psa_casadi.diagnosis.search import fits, moves
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, View, examine, hypothesis
 from psa_casadi.diagnosis.search.state import FINALISTS, NONE, Names, SearchState
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.model.effects.mechanics import STRUCTURAL_MODE
+from psa_casadi.model.effects.mechanics import structural_mode
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.timings import Work, counted, stage
 
@@ -247,11 +247,11 @@ class _Search:
 
         Where fast records show several, or where one leaves structure.
         """
-        name = STRUCTURAL_MODE.name
-        if STRUCTURAL_MODE not in self.task.table or not view.test.alarm:
+        name = structural_mode.name
+        if structural_mode not in self.task.table or not view.test.alarm:
             return False
         less = self.known.hypotheses.get(h.names - {name})
-        if less is None or not (name in h.names or (self.task.fast and not h.causes)):
+        if less is None or not (name in h.names or (self.task.is_fast(h.fit) and not h.causes)):
             return False
         if self.shaken.get(less.names) is less.fit or not self.does("several modes"):
             return False
@@ -310,15 +310,15 @@ class _Search:
             task.progress(f"without {h.causes[-1].name}, one mode instead")
             for one in moves.one_mode(h, before):
                 self.known.note(one)
-            self.known.remember(before, STRUCTURAL_MODE.name)
+            self.known.remember(before, structural_mode.name)
         if before is None or has_series(h) or not self.does("resonances"):
             return
         last, fit = h.causes[-1], None
         if base_fit.rings(last):
-            fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.experiments, task.progress)
+            fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.progress)
         if fit is None and not before.causes and not self.is_new(before):
-            fit = base_fit.instead_of(before.fit, h.fit, task.experiments, task.progress)
-        self.known.note(hypothesis(before.causes, fit, task.experiments, final=True))
+            fit = base_fit.instead_of(before.fit, h.fit, task.progress)
+        self.known.note(hypothesis(before.causes, fit, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
         """Fit with resonances that the base lacks; whether that explains more.
@@ -327,20 +327,20 @@ class _Search:
         as much as an effect would; it bends itself to a cause that is not known yet, so that
         without a cause it counts only where nothing is left to explain.
         """
-        task, experiments = self.task, self.task.experiments
+        task = self.task
         if not view.test.alarm or not self.does("resonances"):
             return False
-        if task.fast and not h.causes and self.seen_in_records():
+        if task.is_fast(h.fit) and not h.causes and self.seen_in_records():
             return True
         if not self.once("ringing", h.names):
             return False
-        rung = base_fit.ringing(h.fit, experiments)
+        rung = base_fit.ringing(h.fit)
         if rung is None or rung.decrease < base_fit.SEEN:
             return False
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False
-        fit = base_fit.from_band(h.fit, experiments, task.progress)
-        other = hypothesis(h.causes, fit, experiments, final=True)
+        fit = base_fit.from_band(h.fit, task.progress)
+        other = hypothesis(h.causes, fit, final=True)
         if other is not None and (h.causes or not examine(other, task, self.known.trials).leaves):
             self.known.note(other)
         return self.known.hypotheses.get(h.names) is not h
@@ -350,8 +350,8 @@ class _Search:
         root, task = self.known.root, self.task
         if not self.once("resonances", NONE) or not self.does("resonances"):
             return False
-        fitted = base_fit.from_resonances(root.fit, task.experiments, task.progress)
-        self.known.note(hypothesis((), fitted, task.experiments, final=True))
+        fitted = base_fit.from_resonances(root.fit, task.progress)
+        self.known.note(hypothesis((), fitted, final=True))
         return self.known.root is not root
 
     def report(self, h: Hypothesis, what: str) -> None:

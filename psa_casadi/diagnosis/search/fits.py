@@ -11,11 +11,11 @@ from psa_casadi.diagnosis.screening import Copy, Score, Together
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis, near_end
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, fit
 from psa_casadi.identification.fitting.levenberg_marquardt import FIRST_RADIUS, LEAST_RADIUS
-from psa_casadi.identification.refitting import quick_rtol, refit, weighted
+from psa_casadi.identification.refitting import quick_rtol, refit
 from psa_casadi.identification.start.ordinary import has_loop, ordinary_values
 from psa_casadi.model.component import Component
 from psa_casadi.model.variables import Parameter
-from psa_casadi.records.split import Experiment, fitted
+from psa_casadi.records.split import fitted
 from psa_casadi.simulation.side_by_side import side_by_side
 from psa_casadi.simulation.start import is_stack
 
@@ -28,7 +28,6 @@ Start = tuple[dict[str, float], float, tuple[dict[str, float], ...]]
 
 def quick_fit(
     before: Fit,
-    experiments: Sequence[Experiment],
     effect: Component,
     starts: Sequence[Start],
     reset: dict[str, float],
@@ -45,18 +44,17 @@ def quick_fit(
     for values, gain, memory in starts:
         least = min([goal, before.cost, *(f.cost for f in fits)])
         added = [(effect, values, gain)]
-        quick = fit_with_all(before, experiments, added, memory, reset, evaluations, least)
+        quick = fit_with_all(before, added, memory, reset, evaluations, least)
         fits += [quick] if quick is not None else []
     if not any(f.cost < before.cost for f in fits):
         nested, states = [(effect, starts[0][0], 0.0)], tuple(before.starts())
-        last = fit_with_all(before, experiments, nested, states, {}, 3 * QUICK, goal)
+        last = fit_with_all(before, nested, states, {}, 3 * QUICK, goal)
         fits += [last] if last is not None else []
     return min(fits, key=lambda f: f.cost, default=None)
 
 
 def fit_with_all(
     before: Fit,
-    experiments: Sequence[Experiment],
     added: Sequence[tuple[Component, dict[str, float], float]],
     memory: tuple[dict[str, float], ...],
     reset: dict[str, float],
@@ -71,7 +69,6 @@ def fit_with_all(
     held = series_parameters(before)
     names = [n for n in before.unknowns.names if n not in held]
     names += [n for effect, _, _ in added for n in effect.fitted if n not in names]
-    rtol = quick_rtol(before.sigma, experiments)
     for share in (1.0, 0.3):
         model = before.model
         try:
@@ -83,16 +80,16 @@ def fit_with_all(
                 model = model.with_effect(effect, {**effect.at_gain(size, values), **reset})
             result = fit(
                 model,
-                weighted(before, experiments),
+                before.experiments,
                 names,
                 sigma=before.sigma,
                 start_states=memory,
                 evaluations=evaluations,
                 tolerance=1e-3,
-                rtol=rtol,
+                rtol=quick_rtol(before.sigma, before.experiments),
                 goal=np.inf if held else goal,
             )
-            return continued(result, experiments, rtol, 1e-3, _FREED) if held else result
+            return continued(result, _FREED) if held else result
         except PsaError:
             continue
     return None
@@ -104,29 +101,24 @@ def series_parameters(of: Fit) -> tuple[str, ...]:
 
 
 def continued(
-    current: Fit,
-    experiments: Sequence[Experiment],
-    rtol: float,
-    tolerance: float,
-    evaluations: int,
-    goal: float = np.inf,
-    *,
-    patient: bool = False,
-) -> Fit:
+    current: Fit, evaluations: int, goal: float = np.inf, *,
+    tolerance: float = 1e-3, rtol: float = np.inf, patient: bool = False,
+) -> Fit:  # fmt: skip
     """Go on with a fit from where it stopped, with all that is free. Raises PsaError.
 
     It ends early where its cost will stay above the `goal`; `patient` it goes on along a valley.
+    The stepper's tolerance `rtol` is at most that of quick fits.
     """
     names = current.unknowns.names
     return fit(
         current.model,
-        weighted(current, experiments),
+        current.experiments,
         [*names, *(n for n in series_parameters(current) if n not in names)],
         sigma=current.sigma,
         start_states=current.starts(),
         evaluations=evaluations,
         tolerance=tolerance,
-        rtol=rtol,
+        rtol=min(rtol, quick_rtol(current.sigma, current.experiments)),
         goal=goal,
         patient=patient,
         radius=float(np.clip(current.radius, LEAST_RADIUS, FIRST_RADIUS)),
@@ -138,7 +130,7 @@ def cost_beside(other: Hypothesis, of: Hypothesis) -> float:
 
     Of the displacement and of further columns.
     """
-    parts = [*zip(other.fit.residuals_of(of.experiments), of.fit.sigma, strict=True)]
+    parts = [*zip(other.fit.record_residuals, of.fit.sigma, strict=True)]
     pairs = zip(other.fit.further, of.fit.further, strict=True)
     parts += [(f.residuals, g.level) for f, g in pairs]
     return sum(float(np.sum((part / level) ** 2)) for part, level in parts)
@@ -158,9 +150,7 @@ _POLISHING = ((1e-5, 1e-3, 100), (FIT_RTOL, 1e-4, 8))
 
 
 def with_cause(
-    before: Hypothesis,
-    scores: Sequence[Score],
-    goal: float = np.inf,
+    before: Hypothesis, scores: Sequence[Score], goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit quickly with one more cause from its best directions; None if every fit fails.
 
@@ -168,8 +158,8 @@ def with_cause(
     """
     effect = scores[0].direction.effect
     starts = [(s.direction.values, s.start, s.direction.memory) for s in scores]
-    quick = quick_fit(before.fit, before.experiments, effect, starts, {}, goal=goal)
-    return hypothesis((*before.causes, effect), quick, before.experiments)
+    quick = quick_fit(before.fit, effect, starts, {}, goal=goal)
+    return hypothesis((*before.causes, effect), quick)
 
 
 def with_causes(before: Hypothesis, start: Together, goal: float = np.inf) -> Hypothesis | None:
@@ -182,8 +172,8 @@ def with_causes(before: Hypothesis, start: Together, goal: float = np.inf) -> Hy
         {k: v for d in start.directions for k, v in d.memory[r].items()} | state
         for r, state in enumerate(before.fit.starts())
     )
-    quick = fit_with_all(before.fit, before.experiments, added, memory, {}, _SET_AFRESH, goal)
-    return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
+    quick = fit_with_all(before.fit, added, memory, {}, _SET_AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick)
 
 
 def with_causes_afresh(
@@ -201,9 +191,9 @@ def with_causes_afresh(
         size = np.copysign(_ORDINARY * _typical(before.fit, d.effect), side * gain)
         values = _ordinary_form(d.effect, d.values)
         added.append((d.effect, values, d.unit_gain if d.finite else float(size)))
-    ordinary, states = _ordinary_base(before.fit, before.experiments)
-    quick = fit_with_all(before.fit, before.experiments, added, states, ordinary, _SET_AFRESH, goal)
-    return hypothesis((*before.causes, *(a[0] for a in added)), quick, before.experiments)
+    ordinary, states = _ordinary_base(before.fit)
+    quick = fit_with_all(before.fit, added, states, ordinary, _SET_AFRESH, goal)
+    return hypothesis((*before.causes, *(a[0] for a in added)), quick)
 
 
 def fit_from_default(
@@ -216,24 +206,24 @@ def fit_from_default(
     The result is of use below the cost of the first fit, and below the `goal`.
     """
     effect = first.causes[-1]
-    fits = _from_ordinary(before.fit, before.experiments, effect, first.fit.model.values)
+    fits = _from_ordinary(before.fit, effect, first.fit.model.values)
     goal = min(goal, cost_beside(first, before))
-    final = _best_continued(fits, before.experiments, _CONTINUED, goal)
-    return hypothesis(first.causes, final, before.experiments)
+    final = _best_continued(fits, _CONTINUED, goal)
+    return hypothesis(first.causes, final)
 
 
 def fit_any_from_default(before: Hypothesis, scores: Sequence[Score]) -> Hypothesis | None:
     """Fit the effects of the scores from default values; return the best of all."""
     results = side_by_side(
-        lambda d: _from_ordinary(before.fit, before.experiments, d.effect, d.values),
+        lambda d: _from_ordinary(before.fit, d.effect, d.values),
         [score.direction for score in scores],
     )
     every = [f for fits in results for f in fits]
-    final = _best_continued(every, before.experiments, _CONTINUED_ANY)
+    final = _best_continued(every, _CONTINUED_ANY)
     if final is None:
         return None
     effect = next(e for e in final.model.components if e not in before.fit.model.components)
-    return hypothesis((*before.causes, effect), final, before.experiments)
+    return hypothesis((*before.causes, effect), final)
 
 
 def in_place(
@@ -259,10 +249,7 @@ def in_place(
 
 
 def like(
-    whole: Hypothesis,
-    less: Hypothesis,
-    copy: Copy,
-    goal: float = np.inf,
+    whole: Hypothesis, less: Hypothesis, copy: Copy, goal: float = np.inf
 ) -> Hypothesis | None:
     """Fit an effect that could copy a cause of the `whole`, from where that has led the base.
 
@@ -290,14 +277,12 @@ def exchanged(
     values = reached.model.values
     base = {n: values[n] for n in less.fit.unknowns.names if n in values}
     causes = tuple(effect if c not in less.causes else c for c in whole.causes)
-    quick = quick_fit(less.fit, less.experiments, effect, [start], base, _BESIDE, goal)
-    return hypothesis(causes, quick, less.experiments)
+    quick = quick_fit(less.fit, effect, [start], base, _BESIDE, goal)
+    return hypothesis(causes, quick)
 
 
 def without(
-    whole: Hypothesis,
-    cause: Component,
-    known: Hypothesis | None = None,
+    whole: Hypothesis, cause: Component, known: Hypothesis | None = None
 ) -> Hypothesis | None:
     """Fit without a cause from where the whole has led; None where that cannot be simulated.
 
@@ -312,12 +297,11 @@ def without(
     for share in _SHARES:
         try:
             start = model.with_values({n: share * model.values[n] for n in gains})
-            parts = weighted(whole.fit, whole.experiments)
             sigma = None if is_stack(start) else whole.fit.sigma
-            result = refit(replace(whole.fit, model=start), parts, names, sigma=sigma, least=least)
+            result = refit(replace(whole.fit, model=start), names, sigma=sigma, least=least)
         except PsaError:
             continue
-        return hypothesis(causes, result, whole.experiments, final=True)
+        return hypothesis(causes, result, final=True)
     return None
 
 
@@ -328,22 +312,22 @@ def as_led(whole: Hypothesis, cause: Component) -> Hypothesis | None:
     """
     model = whole.fit.model.without([cause.name])
     names = [n for n in whole.fit.unknowns.names if n in model.values]
-    start, parts = replace(whole.fit, model=model), weighted(whole.fit, whole.experiments)
+    start = replace(whole.fit, model=model)
     try:
-        result = refit(start, parts, names, sigma=whole.fit.sigma, evaluations=1)
+        result = refit(start, names, sigma=whole.fit.sigma, evaluations=1)
     except PsaError:
         return None
     causes = [c for c in whole.causes if c is not cause]
-    return hypothesis(causes, result, whole.experiments)
+    return hypothesis(causes, result)
 
 
 def together(of: Hypothesis) -> Hypothesis | None:
     """Fit all parameters once more, weighted by the noise that the residuals now suggest."""
     try:
-        result = refit(of.fit, weighted(of.fit, of.experiments), of.fit.unknowns.names)
+        result = refit(of.fit)
     except PsaError:
         return None
-    return hypothesis(of.causes, result, of.experiments, final=True)
+    return hypothesis(of.causes, result, final=True)
 
 
 def to_end(of: Hypothesis, goal: float = np.inf) -> Hypothesis:
@@ -351,18 +335,17 @@ def to_end(of: Hypothesis, goal: float = np.inf) -> Hypothesis:
 
     One whose cost will stay above the `goal` is not final.
     """
-    current, experiments = of.fit, of.experiments
-    loosest = quick_rtol(current.sigma, experiments)
+    current = of.fit
     for rtol, tolerance, evaluations in _POLISHING:
         try:
             current = continued(
-                current, experiments, min(rtol, loosest), tolerance, evaluations, goal, patient=True
+                current, evaluations, goal, tolerance=tolerance, rtol=rtol, patient=True
             )
         except PsaError:
             return replace(of, final=True)
         if current.cost > goal:
             break
-    ended = hypothesis(of.causes, current, experiments, final=current.cost <= goal)
+    ended = hypothesis(of.causes, current, final=current.cost <= goal)
     return ended or replace(of, final=True)
 
 
@@ -383,24 +366,17 @@ def refit_at_bound(of: Hypothesis) -> Hypothesis | None:
     def begin(share: float) -> Fit | None:
         try:
             model = of.fit.model.with_values({**table, **{n: share * values[n] for n in gains}})
-            start = replace(of.fit, model=model)
-            rtol = quick_rtol(of.fit.sigma, of.experiments)
-            return continued(start, of.experiments, rtol, 1e-3, _AFRESH, of.fit.cost)
+            return continued(replace(of.fit, model=model), _AFRESH, of.fit.cost)
         except PsaError:
             return None
 
     fits = [f for f in side_by_side(begin, _AGAIN) if f is not None and f.cost < of.fit.cost]
     best = min(fits, key=lambda f: f.cost, default=None)
-    result = hypothesis(of.causes, best, of.experiments)
+    result = hypothesis(of.causes, best)
     return None if result is None else to_end(result)
 
 
-def _from_ordinary(
-    before: Fit,
-    experiments: Sequence[Experiment],
-    effect: Component,
-    known: Mapping[str, float],
-) -> list[Fit]:
+def _from_ordinary(before: Fit, effect: Component, known: Mapping[str, float]) -> list[Fit]:
     """Quick fits from an ordinary base and gains; forms and frequencies are the `known` ones."""
     gain, size = _parameter(effect, effect.gain), _typical(before, effect)
     sizes = [_ORDINARY, *(s for s in effect.finite_step if s > _ORDINARY)]
@@ -408,12 +384,12 @@ def _from_ordinary(
         sizes.append(-_ORDINARY)
     values = _ordinary_form(effect, known)
     loops = (False, True) if has_loop(before.model) else (False,)
-    bases = [_ordinary_base(before, experiments, soon=soon) for soon in loops]
+    bases = [_ordinary_base(before, soon=soon) for soon in loops]
 
     def start(base: tuple[_Base, float]) -> Fit | None:
         (ordinary, states), share = base
         added = [(effect, values, share * size)]
-        return fit_with_all(before, experiments, added, states, ordinary, QUICK)
+        return fit_with_all(before, added, states, ordinary, QUICK)
 
     starts = list(itertools.product(bases, sizes))
     return [f for f in side_by_side(start, starts) if f is not None]
@@ -423,26 +399,23 @@ def _from_ordinary(
 _Base = tuple[dict[str, float], tuple[dict[str, float], ...]]
 
 
-def _ordinary_base(before: Fit, experiments: Sequence[Experiment], *, soon: bool = False) -> _Base:
+def _ordinary_base(before: Fit, *, soon: bool = False) -> _Base:
     """Return an ordinary stack at rest; any other model goes on from its values and states.
 
     The states of a loop that is bent would bend the ordinary one.
     """
     if not is_stack(before.model):
         return {}, tuple(before.starts())
-    records = [e.record for e in fitted(experiments)]
+    records = [e.record for e in fitted(before.experiments)]
     return ordinary_values(before.model, records, soon=soon), ()
 
 
-def _best_continued(
-    fits: Sequence[Fit], experiments: Sequence[Experiment], count: int, goal: float = np.inf
-) -> Fit | None:
+def _best_continued(fits: Sequence[Fit], count: int, goal: float = np.inf) -> Fit | None:
     """Continue the `count` best fits, unless they stay above the goal; return the best then."""
 
     def further(quick: Fit) -> Fit:
         try:
-            rtol = quick_rtol(quick.sigma, experiments)
-            return continued(quick, experiments, rtol, 1e-3, _AFRESH, goal)
+            return continued(quick, _AFRESH, goal)
         except PsaError:
             return quick
 

@@ -22,11 +22,9 @@ import scipy
 
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.colour import Colour, residual_colour, rms
+from psa_casadi.diagnosis.colour import Colour, OwnColour, own_colour, residual_colour, rms
 from psa_casadi.diagnosis.held_out import held_out_gain
-from psa_casadi.diagnosis.noise import known_colour
-from psa_casadi.diagnosis.omnibus import Omnibus
-from psa_casadi.diagnosis.own_colour import OwnColour, own_colour
+from psa_casadi.diagnosis.noise import Omnibus, known_colour
 from psa_casadi.diagnosis.pack import Pack, Task
 from psa_casadi.diagnosis.probes import Direction, directions
 from psa_casadi.diagnosis.process_noise import entering
@@ -49,7 +47,7 @@ from psa_casadi.simulation.timings import stage
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """A model with some causes added to the base, fitted to the records of `experiments`.
+    """A model with some causes added to the base, fitted to records.
 
     `causes` are in the order of the search; `predictions` (n, channels) are the
     predictions of whole records; `held`, `train` and `whole` are the rms errors of every channel in
@@ -60,13 +58,17 @@ class Hypothesis:
 
     causes: tuple[Component, ...]
     fit: Fit
-    experiments: Sequence[Experiment]
     predictions: tuple[FloatArray, ...]
     held: tuple[float, ...]
     train: tuple[float, ...]
     whole: tuple[float, ...]
     colours: tuple[OwnColour, ...]
     final: bool = False
+
+    @property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The records with the samples that are fitted and judged."""
+        return self.fit.experiments
 
     @property
     def predicted(self) -> tuple[FloatArray, ...]:
@@ -137,20 +139,16 @@ class Hypothesis:
 
 
 def hypothesis(
-    causes: Sequence[Component],
-    fit: Fit | None,
-    experiments: Sequence[Experiment],
-    *,
-    final: bool = False,
+    causes: Sequence[Component], fit: Fit | None, *, final: bool = False
 ) -> Hypothesis | None:
     """Return a fit as a hypothesis; None without a fit, or where it cannot predict the records."""
     if fit is None:
         return None
     try:
-        predictions = tuple(fit.predicted_channels(experiments))
+        predictions = tuple(fit.predicted_channels())
     except PsaError:
         return None
-    rows, colours = [], []
+    rows, colours, experiments = [], [], fit.experiments
     for k, f in enumerate(fit.channels):
         held, train, every, rests = [], [], [], []
         for e, y in zip(experiments, predictions, strict=True):
@@ -170,16 +168,8 @@ def hypothesis(
         colours.append(own_colour(rests, fitted, judged, *follow, rates))
     held_rms, train_rms, whole = zip(*rows, strict=True)
     return Hypothesis(
-        tuple(causes),
-        fit,
-        experiments,
-        predictions,
-        held_rms,
-        train_rms,
-        whole,
-        tuple(colours),
-        final,
-    )
+        tuple(causes), fit, predictions, held_rms, train_rms, whole, tuple(colours), final
+    )  # fmt: skip
 
 
 def noisy(of: Hypothesis, task: Task) -> Hypothesis:
@@ -190,13 +180,13 @@ def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     for k, (f, colour) in enumerate(zip(of.fit.channels, of.colours, strict=True)):
         pairs = zip(of.experiments, of.predictions, strict=True)
         errors = [e.errors(f.number, y[:, k]) for e, y in pairs]
-        own.append(entering(of.fit, of.experiments, errors, k, colour))
+        own.append(entering(of.fit, errors, k, colour))
     return replace(of, colours=tuple(own))
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
     """Return a base fit as the hypothesis without causes. Raises SimulationError."""
-    root = hypothesis((), base, task.experiments, final=True)
+    root = hypothesis((), base, final=True)
     if root is None:
         raise SimulationError(
             "The fitted base cannot be simulated over the whole records; start from a model."
@@ -346,7 +336,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
     and it asks whether the residual is as large everywhere.
     """
     task.progress("screening effects")
-    fit, experiments = of.fit, of.experiments
+    fit = of.fit
     effects = [e for e in task.table if e not in fit.model.components]
     kept: list[Direction] = []
     if known:
@@ -354,14 +344,14 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
         kept = [d for d in known if d.effect in effects and d.effect not in lines]
         effects = lines
     finite = "finite steps" not in task.method.without
-    kept += directions(fit, experiments, effects, finite_steps=finite)
+    kept += directions(fit, effects, finite_steps=finite)
     screening = _screened(fit, kept, task)
     residuals, colour, alone = [f.residuals for f in fit.channels], screening.colour, not of.causes
     if alone:  # is there anything but noise of some colour?
         tested = [c.tested for c in of.colours]
         residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
         colour = replace(colour, further=tuple(others))
-    test = task.pack.tested(fit, residuals, experiments, colour, task.limits, own=alone)
+    test = task.pack.tested(fit, residuals, colour, task.limits, own=alone)
     coloured = alone and any(c.autoregression.size for c in of.colours)
     if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)
@@ -376,7 +366,7 @@ def _asked(
     The best direction of effects with m weights removes chi^2 of m noise variances, with
     Bonferroni's correction for the number of directions.
     """
-    screening = screen(fit, trials, colour.lengths, colour=colour, limits=limits)
+    screening = screen(fit, trials, colour=colour, limits=limits)
     best, count = screening.scores[0], len(screening.scores)
     freedom = max(1, len(best.direction.effect.linear))
     p = min(1.0, count * float(scipy.special.chdtrc(freedom, best.decrease)))
@@ -387,14 +377,13 @@ def _asked(
 
 
 def _screened(fit: Fit, trials: Sequence[Direction], task: Task) -> Screening:
-    experiments, known, colour = task.experiments, None, None
-    lengths = [int(e.at(0).sum()) for e in experiments]
+    known, colour = None, None
     if "remainder" in task.method.without:
-        colour = residual_colour(fit.residuals, lengths)
+        colour = residual_colour(fit.record_residuals)
     elif task.pack.is_stack:
-        pairs = zip(experiments, fit.residuals_of(experiments), strict=True)
+        pairs = zip(fit.experiments, fit.record_residuals, strict=True)
         known = [known_colour(e.record, r) for e, r in pairs]
-    return screen(fit, trials, lengths, known, colour=colour, limits=task.limits)
+    return screen(fit, trials, known, colour=colour, limits=task.limits)
 
 
 #: Share of a range that is near its end.

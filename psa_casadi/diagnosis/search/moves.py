@@ -16,8 +16,8 @@ from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Response, modes_of
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, STRUCTURAL_MODE
-from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.effects.mechanics import FEWEST, MODAL_SERIES, MOST, structural_mode
+from psa_casadi.model.shapes import stiffness_scale
 from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment
 from psa_casadi.simulation.side_by_side import side_by_side
@@ -56,7 +56,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             return None
         left = measured(e.record)[part] - before.predicted[k][part]
         shaken.append(Response(e.record.sample_time, drive[part], left, e.used[part]))
-        free.append(before.fit.jacobian[before.fit.of_record(experiments, k)][first:last])
+        free.append(before.fit.jacobian[before.fit.parts[k]][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []
     fit, states = before.fit, tuple(before.fit.starts())
     while len(modes) >= FEWEST:
@@ -67,12 +67,12 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             for name, value in asdict(mode).items()
         }
         added = [(effect, values, 1.0)]
-        result = fits.fit_with_all(fit, experiments, added, states, {}, _EVALUATIONS)
+        result = fits.fit_with_all(fit, added, states, {}, _EVALUATIONS)
         if result is None:
             return None
         ringing = [m for m in _modes(result, len(modes)) if m.damping < MOST_DAMPED]
         if len(ringing) == len(modes):
-            return hypothesis((*before.causes, effect), result, experiments)
+            return hypothesis((*before.causes, effect), result)
         base = result.model.without([effect.name])
         modes, states = ringing, tuple(result.starts())
         fit = replace(before.fit, model=base)
@@ -87,7 +87,7 @@ def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
     """
     fit = series.fit
     states = tuple(fit.starts())
-    low, high = next(p.bounds for p in STRUCTURAL_MODE.parameters if p.name == "mode_lead")
+    low, high = next(p.bounds for p in structural_mode.parameters if p.name == "mode_lead")
     starts: list[fits.Start] = []
     for mode in _modes(fit, series.causes[-1].count):
         lead = float(np.clip(mode.ahead / (mode.share or 1e-300), low, high))
@@ -95,7 +95,7 @@ def one_mode(series: Hypothesis, less: Hypothesis) -> list[Hypothesis]:
             "mode_frequency": mode.frequency, "mode_damping": mode.damping, "mode_lead": lead
         }  # fmt: skip
         starts.append((form, mode.share, states))
-    results = side_by_side(lambda s: fits.exchanged(series, less, STRUCTURAL_MODE, s, fit), starts)
+    results = side_by_side(lambda s: fits.exchanged(series, less, structural_mode, s, fit), starts)
     best = sorted((h for h in results if h is not None), key=lambda h: h.fit.cost)[:_ALONE]
     return side_by_side(fits.to_end, best)
 

@@ -1,14 +1,24 @@
-"""The state of a search: every hypothesis by its causes, and which of them is the best."""
+"""The state of a search, and the steps to its answer.
 
-from collections.abc import Sequence
-from dataclasses import replace
+Every hypothesis by its causes, and which of them is the best; then the causes of the best one by
+one, and the rivals of each.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.common.notes import Note
+from psa_casadi.common.errors import InputError
+from psa_casadi.common.notes import Note, note
+from psa_casadi.common.progress import Progress, silent
+from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import excess_power, noise_rms
-from psa_casadi.diagnosis.pack import Task, is_dynamic
-from psa_casadi.diagnosis.search.fits import as_led, cost_beside, refit_at_bound, to_end
+from psa_casadi.diagnosis.noise import Omnibus
+from psa_casadi.diagnosis.pack import STACK, Task, is_dynamic
+from psa_casadi.diagnosis.result import Contender
+from psa_casadi.diagnosis.screening import Screening, credible_set, levelled, probabilities
+from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import (
     Hypothesis,
     View,
@@ -19,10 +29,16 @@ from psa_casadi.diagnosis.search.hypothesis import (
     root_of,
     scale_of,
 )
-from psa_casadi.diagnosis.task import State, Tried
+from psa_casadi.diagnosis.task import State, Thresholds, Tried, same_curves
 from psa_casadi.identification.fitting.fit import Fit
+from psa_casadi.identification.prepare import as_read
 from psa_casadi.identification.refitting import relevelled
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.component import Component
+from psa_casadi.model.compose import Model
+from psa_casadi.records.record import Record
+from psa_casadi.records.split import whole
 from psa_casadi.simulation.side_by_side import side_by_side
 
 #: Share of the best one's evidence from which neighbours are nearly as likely, and distance from it
@@ -142,12 +158,16 @@ class SearchState:
 
     def children(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the hypotheses with one more cause that were fitted to one, best first."""
-        children = []
-        for name in self.fitted.get(h.names, ()):
-            if (child := self.hypotheses.get(h.names | {name})) is not None:
-                added = [c for c in child.causes if c.name not in h.names]
-                children.append(replace(child, causes=(*h.causes, *added)))
+        children = [
+            replace(c, causes=(*h.causes, *(a for a in c.causes if a.name not in h.names)))
+            for c in self.fitted_with(h).values()
+        ]
         return sorted(children, key=lambda c: -self.scale.evidence(c))
+
+    def fitted_with(self, h: Hypothesis) -> dict[str, Hypothesis]:
+        """Return the hypotheses with one more effect, by its name."""
+        every = {n: self.hypotheses.get(h.names | {n}) for n in self.fitted.get(h.names, ())}
+        return {n: child for n, child in every.items() if child is not None}
 
     def leaders(self, h: Hypothesis) -> list[Hypothesis]:
         """Return those of the children that are nearly as likely as the best one, best first."""
@@ -161,7 +181,7 @@ class SearchState:
 
         Its evidence with `h` would be below `SHARE` of that one's, and by `NEAR` nats.
         """
-        count, reached = len(h.fit.residuals), cost_beside(best, h)
+        count, reached = len(h.fit.residuals), fits.cost_beside(best, h)
         gained = 0.5 * count * float(np.log(h.fit.cost / reached))
         return h.fit.cost * float(np.exp(-2.0 * nearly(gained) / count))
 
@@ -200,18 +220,18 @@ class SearchState:
         if "begun again" in self.task.method.without:
             return
         final = [self.hypotheses[h.names] for h in hypotheses]
-        for again in side_by_side(refit_at_bound, final):
+        for again in side_by_side(fits.refit_at_bound, final):
             self.note(again)
 
     def _to_end(self, h: Hypothesis) -> Hypothesis:
         """Fit a hypothesis to its end, with the noise that it leaves."""
-        ended = to_end(h)
+        ended = fits.to_end(h)
         if self.task.pack.is_stack:
             return ended
-        levelled, _ = relevelled(ended.fit, h.experiments, every=True)
+        levelled = relevelled(ended.fit, every=True)
         if levelled is ended.fit:
             return ended
-        return hypothesis(ended.causes, levelled, h.experiments, final=True) or ended
+        return hypothesis(ended.causes, levelled, final=True) or ended
 
     def is_admissible(self, h: Hypothesis, *, confirmed: bool = True, form: bool = True) -> bool:
         """Whether every cause may be part of the answer.
@@ -224,7 +244,7 @@ class SearchState:
 
     def _may_hold(self, h: Hypothesis, cause: Component, *, confirmed: bool, form: bool) -> bool:
         out, pack = self.task.method.without, self.task.pack
-        if not pack.is_admissible(h.fit, cause, h.experiments):
+        if not pack.is_admissible(h.fit, cause):
             return False
         before = self.hypotheses.get(h.names - {cause.name})
         least = self.views[NONE].test.detection_limit
@@ -245,7 +265,7 @@ class SearchState:
         if (h, before) not in self.noises:
             result = self.exceeds(h, before)
             if result and before.colours[0].autoregression.size:
-                led = as_led(h, cause)
+                led = fits.as_led(h, cause)
                 result = led is None or self.exceeds(h, led)
             self.noises[h, before] = result
         return self.noises[h, before]
@@ -288,7 +308,7 @@ class SearchState:
             return True
         if (h, before) not in self.memories:
             added = [new - old for new, old in zip(h.predicted, before.predicted, strict=True)]
-            dynamic = is_dynamic(added, before.fit, h.experiments, self.task.limits)
+            dynamic = is_dynamic(added, before.fit, self.task.limits)
             self.memories[h, before] = dynamic
         return self.memories[h, before]
 
@@ -303,7 +323,7 @@ class SearchState:
         """Whether structure remains and the causes explain less than most of the excess."""
         colour = self.view(h).screening.colour
         floor = noise_rms(h.fit.residuals, colour)
-        excess = excess_power(self.base.residuals, colour, floor)
+        excess = excess_power(self.base.residuals, floor)
         explained = self.base.rms**2 - h.fit.rms**2
         return self.view(h).test.alarm and explained < _EXPLAINED * excess
 
@@ -311,3 +331,210 @@ class SearchState:
 def nearly(gained: float) -> float:
     """Return the evidence from which on a fit is nearly as likely as one that has `gained` more."""
     return min(SHARE * gained, gained - NEAR)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A hypothesis on the way to the best one, and the cause that comes next.
+
+    `fitted` are the hypotheses with one more effect; `alone` is ln B of every effect over this
+    hypothesis, of all samples that choose (`Scale.gain`), `evidence` that over all other causes
+    where there are later ones, and of effects that bend the same curve the best one's;
+    `probability` that of being the cause, on condition that one effect of the table is. `chosen` is
+    the hypothesis with the next cause, None of the last step; `without` the one with all causes but
+    this, `view_without` what that one leaves, and `instead` the hypotheses with other effects in
+    this cause's place. `remarks` of the last step state what the search has left.
+    """
+
+    view: View
+    fitted: Mapping[str, Hypothesis] = field(default_factory=dict)
+    chosen: Hypothesis | None = None
+    without: Hypothesis | None = None
+    view_without: View | None = None
+    instead: Mapping[str, Hypothesis] = field(default_factory=dict)
+    alone: Mapping[str, float] = field(default_factory=dict)
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    probability: Mapping[str, float] = field(default_factory=dict)
+    remarks: tuple[Note, ...] = ()
+
+    @property
+    def fit(self) -> Fit:
+        """The fit of the hypothesis."""
+        return self.view.of.fit
+
+    @property
+    def predicted(self) -> tuple[FloatArray, ...]:
+        """Its predictions of whole records [m]."""
+        return self.view.of.predicted
+
+    @property
+    def screening(self) -> Screening:
+        """The screening of further effects."""
+        return self.view.screening
+
+    @property
+    def test(self) -> Omnibus:
+        """The omnibus test of its residual."""
+        return self.view.test
+
+    @property
+    def cause(self) -> Component:
+        """The next cause. Raises ValueError of the last step."""
+        if self.chosen is None:
+            raise ValueError("the last step has no cause")
+        return self.chosen.causes[-1]
+
+
+def steps_of(known: SearchState) -> list[Step]:
+    """Return the steps to the best hypothesis; the last one is that itself."""
+    ways = [*(_way(known, k) for k in range(len(known.answer.causes))), known.answer]
+    views = [_view(known, h) for h in ways]
+    steps = [_step(known, *pair) for pair in zip(views, [*ways[1:], None], strict=True)]
+    return [*steps[:-1], replace(steps[-1], remarks=known.remarks)]
+
+
+def unsearched(base: Fit, task: Task) -> list[Step]:
+    """Return the one step of a base fit that is not searched."""
+    view = examine(root_of(base, task), task)
+    return [Step(view, alone=view.estimated(), evidence=view.estimated())]
+
+
+def _way(known: SearchState, count: int) -> Hypothesis:
+    """Return the hypothesis with the first `count` of the best one's causes."""
+    best = known.answer
+    fitted = known.hypotheses.get(best.names_upto(count))
+    if fitted is not None:
+        return replace(fitted, causes=best.causes[:count])
+    for cause in best.causes[: count - 1 : -1]:
+        less = fits.without(best, cause)
+        best = best if less is None else less
+    return best
+
+
+def _view(known: SearchState, h: Hypothesis) -> View:
+    """Look at a hypothesis; what effects would add is known from where the search began."""
+    view = known.views.get(h.names)
+    if view is None or view.of.fit is not h.fit:
+        known.views[h.names] = view = examine(h, known.task, known.trials)
+    return view if view.of is h else replace(view, of=h)
+
+
+def _step(known: SearchState, view: View, chosen: Hypothesis | None) -> Step:
+    scale, among, refused = known.scale, known.fitted_with(view.of), set[str]()
+    if chosen is not None:
+        among[chosen.causes[-1].name] = chosen
+    alone = {**view.estimated(), **{n: scale.gain(h, view.of) for n, h in among.items()}}
+    step, evidence, whole = Step(view, among, chosen, alone=alone), alone, scale.evidence(view.of)
+    if chosen is None:
+        refused = {n for n, h in among.items() if h.names not in known.admissible}
+        return _judged(step, evidence, among, refused, whole, known.task)
+    cause, answer = chosen.causes[-1], known.answer
+    less = known.hypotheses.get(answer.names - {cause.name}) or fits.without(answer, cause)
+    if less is not None:  # else it cannot be fitted; the effects are without the later causes
+        there, among = _view(known, less), {**known.fitted_with(less), cause.name: answer}
+        evidence = {**there.estimated(), **{n: scale.gain(h, less) for n, h in among.items()}}
+        refused = {n for n, h in among.items() if h.names not in known.admissible} - {cause.name}
+        step = replace(step, without=less, view_without=there, instead=among)
+        whole = scale.evidence(answer)
+    return _judged(step, evidence, among, refused, whole, known.task)
+
+
+def _judged(
+    step: Step,
+    evidence: Mapping[str, float],
+    fitted: Mapping[str, Hypothesis],
+    refused: set[str],
+    whole: float,
+    task: Task,
+) -> Step:
+    """Return a step with evidence and probability; `refused` effects may not be the answer.
+
+    `whole` is the evidence over the plain base of the model with the cause.
+
+    Effects that bend the same curve are refused together, and share what the best of them has.
+    """
+    similar, good, pack = task.indistinguishable(step.fit), set(fitted) - refused, task.pack
+    for group in similar:
+        if good & set(group):
+            every = [(n, h, c) for n, h in fitted.items() for c in h.causes if n == c.name]
+            like = {n for n, h, c in every if pack.is_admissible(h.fit, c)}
+            refused = refused - (set(group) & like)
+        elif refused & set(group):
+            refused = refused | set(group)
+    shared = levelled(evidence, similar, good)
+    chances = probabilities(
+        {n: v for n, v in shared.items() if n not in refused}, whole, task.limits
+    )
+    return replace(step, evidence=shared, probability=chances)
+
+
+def contenders(step: Step, limits: Thresholds, names: Sequence[str] = ()) -> tuple[Contender, ...]:
+    """Return effects of one step of the search with their fits; those not fitted are fitted now.
+
+    Without `names` they are the fewest that hold the cause with the probability `credible`. An
+    effect whose fit fails is left out.
+    """
+    names = names or credible_set(step.probability, limits.credible)
+    result = dict(step.fitted)
+    scale = scale_of(step.view.of, step.screening.colour, replace(limits, price=0.0))
+    known = dict(step.evidence)
+    for name in names:
+        scores = [] if name in result else step.view.starts_of(name)
+        fitted = fits.with_cause(step.view.of, scores) if scores else None
+        if fitted is not None:
+            result[name] = fits.to_end(fitted)
+            known[name] = scale.gain(result[name], step.view.of)
+    return tuple(Contender(n, result[n].fit, known[n]) for n in names if n in result)
+
+
+def one_of_each(result: Sequence[Contender]) -> tuple[tuple[Contender, ...], tuple[Note, ...]]:
+    """Return the contenders that a voltage may separate, and notes on those that none separates.
+
+    Of effects that bend the same curve the best fit represents all.
+    """
+    best = sorted(result, key=lambda c: c.fit.cost)
+    effects = [next(e for e in c.fit.model.components if e.name == c.effect) for c in best]
+    groups = same_curves(effects, best[0].fit) if best else ()
+    rest = {name for group in groups for name in group[1:]}
+    same = tuple(note("same_curve", effects=group) for group in groups)
+    return tuple(c for c in result if c.effect not in rest), same
+
+
+def fit_contenders(
+    records: Sequence[Record],
+    effects: Sequence[Component],
+    *,
+    model: Model | None = None,
+    progress: Progress = silent,
+) -> tuple[Fit, tuple[Contender, ...]]:
+    """Fit the base and each of the named effects to records in full, without a verdict.
+
+    Raises InputError where an effect cannot be fitted to them.
+    """
+    experiments = tuple(whole(as_read(r)) for r in records)
+    start = chosen_start(records, model, None)[0].without(e.name for e in effects)
+    base = fit_base(start, experiments, progress=progress)
+    task = Task(tuple(effects), STACK, progress=progress)
+    return base, fitted_rivals(base, task)
+
+
+def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
+    """Fit each effect of a task with the base, without a verdict.
+
+    Raises InputError where an effect cannot be fitted.
+    """
+    plain = hypothesis((), base, final=True)
+    if plain is None:
+        raise InputError(["The fitted base cannot be simulated over the whole of these records."])
+    view = examine(plain, task)
+    task.progress("fitting the rivals")
+    step = Step(view, evidence=view.estimated())
+    names = [e.name for e in task.table]
+    chosen = contenders(step, task.limits, names)
+    lost = {*names} - {c.effect for c in chosen}
+    if lost:
+        raise InputError(
+            f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
+            " to tell apart; leave the records out to design from ordinary sizes."
+        )
+    return chosen

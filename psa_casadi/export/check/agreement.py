@@ -13,12 +13,13 @@ import numpy as np
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.strict_json import read_json
 from psa_casadi.common.units import FloatArray
-from psa_casadi.export.check.rows import BREAKDOWNS
+from psa_casadi.export.check.rows import BREAKDOWNS, CheckRow
 from psa_casadi.export.common.variable_table import starts_at_voltage
 from psa_casadi.export.fixed_step.export import STEPS, VOLTAGES, main_output, played_inputs
 from psa_casadi.export.fmu import reference_run
 from psa_casadi.export.fmu.sources import FIXED_ENTRY, fixed_step_of
-from psa_casadi.export.importer.masters import Signals
+from psa_casadi.export.importer.fmu import Fmu
+from psa_casadi.export.importer.masters import Signals, co_simulate
 from psa_casadi.model.components import BASE, SIMPLIFIED
 from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import nominal_value
@@ -308,3 +309,75 @@ def _run(model: Model, name: str, stated: StatedStep, *, held: bool, every: int 
         scale=np.where(scale > 0.0, scale, model.output_nominals()[column]),
         by="reference" if exact else "simulator",
     )
+
+
+#: How far a repeated run may be off, as a share of its range, by the version of FMI: in FMI 3.0
+#: inputs cannot move within a step, see `_played`.
+RUN_LIMITS = {2: 1e-5, 3: 5e-4}
+#: How far a repeated error may be off, as a share of what is stated.
+ERROR_LIMIT = 0.02
+_PLAYED_TOLERANCE = 1e-9
+#: What a held input may move in a step, over its range; the most steps between two samples.
+_STEP, _MOST_PARTS = 1e-3, 1000
+
+
+@dataclass(frozen=True)
+class Playback:
+    """Inputs, linear between n knots, start values, and what an output must be at these (n,).
+
+    With `stated`, the rms over finite samples of what is expected must be that [m]; else the
+    output itself must be equal.
+    """
+
+    name: str
+    inputs: Signals
+    start: Mapping[str, float]
+    output: str
+    expected: FloatArray
+    stated: float | None = None
+
+
+def played_again(fmu: Fmu, playback: Playback) -> CheckRow:
+    """Return the row of a run that is repeated."""
+    result = _played(fmu, playback)
+    valid = np.isfinite(playback.expected)
+    error = result[valid] - playback.expected[valid]
+    if playback.stated is None:
+        size = float(np.ptp(playback.expected[valid])) or 1.0
+        largest = float(np.max(np.abs(error))) / size
+        remark = f"largest difference of {playback.output} over its range"
+        limit = RUN_LIMITS[fmu.version]
+        return CheckRow(playback.name, largest, limit, largest <= limit, remark)
+    rms = float(np.sqrt(np.mean(error**2)))
+    off = abs(rms / playback.stated - 1.0) if playback.stated > 0.0 else float("inf")
+    remark = f"{1e6 * rms:.4g} um rms, stated {1e6 * playback.stated:.4g} um"
+    return CheckRow(playback.name, off, ERROR_LIMIT, off <= ERROR_LIMIT, remark)
+
+
+def _played(fmu: Fmu, p: Playback) -> FloatArray:
+    """Return the output (n,) at the knots, inputs linear between them.
+
+    Co-simulation of FMI 3.0 has no such inputs. There they are held at the mean over a step, which
+    leaves the end of the step late by half of it; from steps and half steps follows what none is.
+    """
+    knots = p.inputs.times
+
+    def stepped(points: FloatArray) -> FloatArray:
+        values = co_simulate(
+            fmu, points, p.inputs, [p.output], tolerance=_PLAYED_TOLERANCE, values=p.start,
+            centred=True,
+        )  # fmt: skip
+        return np.asarray(values[np.isin(points, knots), 0])
+
+    def divided(parts: int) -> FloatArray:
+        """Return points at which inputs move little, and so many times as many."""
+        counts = parts * np.clip(np.ceil(moved / _STEP), 1, _MOST_PARTS).astype(int)
+        ends = zip(knots, knots[1:], counts, strict=False)
+        steps = [np.linspace(a, b, m, endpoint=False) for a, b, m in ends]
+        return np.concatenate([*steps, knots[-1:]])
+
+    if fmu.takes_lines:
+        return stepped(knots)
+    size = np.maximum(np.ptp(p.inputs.values, axis=0), 1e-300)
+    moved = np.max(np.abs(np.diff(p.inputs.values, axis=0)) / size, axis=1)
+    return 2.0 * stepped(divided(2)) - stepped(divided(1))

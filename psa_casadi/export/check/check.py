@@ -13,10 +13,9 @@ from psa_casadi.common.files import requests_to_end_answered, why_not_read
 from psa_casadi.common.strict_json import read_json
 from psa_casadi.export.check import binaries, description
 from psa_casadi.export.check.agreement import fixed_truth, stated_step, truth_of
-from psa_casadi.export.check.apart import OVERTIME, rows_apart
+from psa_casadi.export.check.apart import OVERTIME, Task, rows_apart
 from psa_casadi.export.check.evidence import repeated, wrong_evidence
 from psa_casadi.export.check.foreign import described
-from psa_casadi.export.check.measured import Task
 from psa_casadi.export.check.rows import (
     LEFT_OUT,
     LEFT_OUT3,
@@ -98,7 +97,7 @@ def check_fmu(
     Its binary for this machine must load on systems like this one, with `portable` on old ones.
     Without lief (`pip install lief`) the binaries are not inspected.
 
-    A `foreign` one, by default every one of another tool without a `model`, is
+    A `foreign` one, by default every one of another tool without a `model`, or around one, is
     checked by the standard alone: a row fails where a clause is violated, and notes what else a
     buyer should know. See docs/howto/fmu_export.md.
 
@@ -125,10 +124,11 @@ def check_fmu(
     end = time.monotonic() + timeout
     with requests_to_end_answered(), Archive(path) as archive:
         if foreign is None:
-            tool = str(archive.description.generationTool)
-            foreign = model is None and not tool.startswith("psa_casadi")
+            ours = str(archive.description.generationTool).startswith("psa_casadi")
+            holds_others = any(archive.directory.glob("resources/*/modelDescription.xml"))
+            foreign = holds_others or (model is None and not ours)
         if foreign:
-            rows += [c.row() for c in described(archive, description.invalid)]
+            rows += [c.row() for c in described(archive)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
             rows += rows_apart(task, end)
             return CheckReport(path, tuple(rows), compared=False, foreign=True)

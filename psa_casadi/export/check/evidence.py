@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from psa_casadi.common.errors import InputError
-from psa_casadi.export.check.measured import ERROR_LIMIT, Playback
+from psa_casadi.export.check.agreement import ERROR_LIMIT, Playback
 from psa_casadi.export.check.rows import BREAKDOWNS, Check, CheckRow, stopped
 from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
 from psa_casadi.export.fmu import evidence as carried
@@ -71,7 +71,7 @@ def repeated(
             inputs = Signals(model.input_names, times, values)
             expected = table[:, names.index("displacement")]
             start = carried.run_start(model)
-            result.append(Playback("reference run", times, inputs, start, "displacement", expected))
+            result.append(Playback("reference run", inputs, start, "displacement", expected))
     except BREAKDOWNS as error:
         result.append(stopped("reference run", f"the check stopped: {error}"))
     for record in records:
@@ -103,7 +103,6 @@ def _of_record(
         judged[first:stop] = True
     return Playback(
         name,
-        times,
         Signals(tuple(inputs), times, np.array(list(inputs.values())).T),
         {n: v for n, v in run.start.items() if n in model.state_names},
         text if text in archive.names("output") else "displacement",

@@ -41,35 +41,51 @@ class CheckRow:
     noted: bool = False
 
 
+class Remark(str):
+    """A remark on what is no violation."""
+
+    __slots__ = ()
+
+
+#: What a check finds: violations, notes, and its figure.
+Findings = Iterable[str | float]
+
+
 @dataclass(frozen=True)
 class Check:
-    """A check that is still to be made: it lists problems, measures a figure, or gives its row.
+    """A check that is still to be made: it lists what it finds, measures a figure, or gives a row.
 
-    No problem may be listed; a figure is at most `limit`, and NaN does not pass.
+    No violation may be listed; a figure is at most `limit`, of any size if that is 0, and NaN does
+    not pass. A foreign FMU's check has the `clause` of the standard, which may be empty: what stops
+    it violates that.
     """
 
     name: str
-    run: Callable[[], Iterable[str] | float | CheckRow]
+    run: Callable[[], Findings | float | CheckRow]
     limit: float = 0.0
+    clause: str | None = None
 
     def row(self) -> CheckRow:
         """Make the check and return its row."""
-        problems: list[str] = []
-        figure = 0.0
+        violations, notes = list[str](), list[str]()
+        figure, limit, foreign = None, 0.0, self.clause is not None
         try:
             check_row = self.run()
             if isinstance(check_row, CheckRow):
                 return check_row
-            if isinstance(check_row, float):
-                figure = check_row
-            else:
-                problems.extend(check_row)
-                figure = float(len(problems))
+            for item in (check_row,) if isinstance(check_row, float) else check_row:
+                if isinstance(item, float):
+                    figure, limit = item, self.limit
+                else:
+                    (notes if isinstance(item, Remark) else violations).append(str(item))
         except BREAKDOWNS as error:
-            problems.append(f"the check stopped: {error}")
-            figure = float("nan")
-        passed = not problems and figure <= self.limit
-        return CheckRow(self.name, figure, self.limit, passed, plain("; ".join(problems)))
+            violations.append(str(error) if foreign else f"the check stopped: {error}")
+            if not foreign:
+                figure, limit = float("nan"), self.limit
+        figure = float(len(violations)) if figure is None else figure
+        passed = not violations and (limit <= 0.0 or figure <= limit)
+        remark, noted = plain("; ".join([*violations, *notes])), foreign and passed and bool(notes)
+        return CheckRow(self.name, figure, limit, passed, remark, self.clause or "", noted)
 
 
 def stopped(name: str, remark: str) -> CheckRow:

@@ -8,6 +8,7 @@ import numpy as np
 
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.check.agreement import Truth
+from psa_casadi.export.check.calls import WORDS
 from psa_casadi.export.common.variable_table import INPUT_LINE, START_VOLTAGE
 from psa_casadi.export.fmu.sources import fixed_step_of
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, Instance
@@ -105,16 +106,28 @@ def incomplete_dependencies(fmu: Fmu) -> Iterator[str]:
     unknowns = list(dict.fromkeys(e.variable.name for e in entries))
     table: dict[str, set[str]] = {name: set() for name in unknowns}
     for instance, point in _at_points(fmu, 1):
-        here = evaluate(instance, point, unknowns)
-        for known in point:
-            moved = {**point, known: point[known] * 1.01}
-            changed = evaluate(instance, moved, unknowns) != here
-            for name in np.array(unknowns)[changed]:
-                table[name].add(known)
+        moved = {n: 1.01 * v for n, v in point.items()}
+        for name, known in movements(instance, point, unknowns, moved):
+            table[name].add(known)
     claims = [(e.variable.name, {d.name for d in e.dependencies or []}) for e in entries]
     missing = {(name, known) for name, claimed in claims for known in table[name] - claimed}
     for name, known in sorted(missing):
         yield f"'{name}' depends on '{known}', which its dependencies do not list"
+
+
+def movements(
+    instance: Instance,
+    point: dict[str, float],
+    unknowns: list[str],
+    moved: Mapping[str, float],
+    rounding: float = 0.0,
+) -> Iterator[tuple[str, str]]:
+    """Yield unknown and known where a known that is moved from a point moves an unknown."""
+    here = evaluate(instance, point, unknowns)
+    for known, value in moved.items():
+        there = evaluate(instance, {**point, known: value}, unknowns)
+        for name in np.array(unknowns)[np.abs(there - here) > rounding * np.abs(here)]:
+            yield str(name), known
 
 
 def directional_error(fmu: Fmu) -> float:
@@ -208,7 +221,6 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
     That is at the start values of its states and inputs, with the outputs that follow from them.
     """
     for interface in fmu.interfaces():
-        kind = "co-simulation" if interface == CO_SIMULATION else "model exchange"
         with fmu.start(interface) as instance:
             result = instance.get(list(truth.starts))
         others = [
@@ -219,9 +231,9 @@ def wrong_start(fmu: Fmu, truth: Truth) -> Iterator[str]:
         if others:
             name, there, value = next((o for o in others if o[0] == "voltage"), others[-1])
             yield (
-                f"in {kind} '{name}' starts at {there:.6g}, the model at {value:.6g}, and"
-                f" {len(others) - 1} more values differ; compare with the model that was exported,"
-                " with its --start-voltage and --history"
+                f"in {WORDS[interface]} '{name}' starts at {there:.6g}, the model at {value:.6g},"
+                f" and {len(others) - 1} more values differ; compare with the model that was"
+                " exported, with its --start-voltage and --history"
             )
 
 

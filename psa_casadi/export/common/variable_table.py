@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import rate_unit
 from psa_casadi.model.compose import Model
-from psa_casadi.model.scales import velocity_scale
+from psa_casadi.model.shapes import velocity_scale
 from psa_casadi.model.variables import Input, Output, State, nominal_value
 
 

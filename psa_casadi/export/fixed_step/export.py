@@ -92,7 +92,7 @@ def main_output(model: Model) -> str:
 
 
 class Probe:
-    """A generated step as a library of this machine."""
+    """A generated step as a library of this machine, compared with the stepper."""
 
     def __init__(self, plan: CodePlan, texts: dict[str, str]) -> None:
         self._plan = plan
@@ -108,15 +108,30 @@ class Probe:
         self._play(len(u), inputs.ctypes.data, y.ctypes.data)
         return y
 
+    def error(self, u: FloatArray) -> float:
+        """Return the largest error over the range of the output on inputs (n, nu).
+
+        The stepper has a far finer tolerance. An error that is no number is infinite. Raises
+        SimulationError where the model itself fails.
+        """
+        plan, model = self._plan, self._plan.model
+        output = model.output_names.index(main_output(model))
+        x0 = np.array([q.start for q in model.structure.states])
+        times = plan.step * np.arange(len(u), dtype=np.float64)
+        hold = "zero" if plan.held else "linear"
+        true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
+        # held inputs hold from their instant on
+        played = self.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
+        size = float(np.ptp(true)) or float(model.output_nominals()[output])
+        worst = float(np.max(np.abs(played - true))) / size
+        return worst if np.isfinite(worst) else float("inf")
+
 
 def errors(plan: CodePlan, texts: dict[str, str]) -> tuple[VoltageError, ...]:
-    """Return the errors on all reference voltages, by the stepper at a far finer tolerance.
-
-    An error that is no number is infinite. Raises SimulationError where the model itself fails.
-    """
+    """Return the errors on all reference voltages; raises what `Probe.error` raises."""
     probe, share = Probe(plan, texts), np.linspace(0.0, 1.0, STEPS + 1)
     return tuple(
-        VoltageError(name, _error(plan, probe, played_inputs(plan.model, shape(share))))
+        VoltageError(name, probe.error(played_inputs(plan.model, shape(share))))
         for name, (_, shape) in VOLTAGES.items()
     )
 
@@ -137,27 +152,10 @@ def reach(plan: CodePlan, texts: dict[str, str], allowed: float) -> float:
     for multiple in _BEYOND:
         u = np.tile([q.start for q in s.inputs], (STEPS + 1, 1))
         u[1:, place] = multiple * usual * jumps[1:]
-        try:
-            if _error(plan, probe, u) <= allowed:
+        with suppress(SimulationError):  # nothing is known of the model there
+            if probe.error(u) <= allowed:
                 return multiple * usual
-        except SimulationError:  # nothing is known of the model there
-            continue
     return usual
-
-
-def _error(plan: CodePlan, probe: Probe, u: FloatArray) -> float:
-    """Return the largest error over the range of the output on inputs (n, nu)."""
-    model = plan.model
-    output = model.output_names.index(main_output(model))
-    x0 = np.array([q.start for q in model.structure.states])
-    times = plan.step * np.arange(len(u), dtype=np.float64)
-    hold = "zero" if plan.held else "linear"
-    true = run(model, times, u, x0, rtol=_RTOL, hold=hold).y[1:, output]
-    # held inputs hold from their instant on
-    played = probe.play(np.vstack([u[:1], u[:-1]]) if plan.held else u)[:, output]
-    size = float(np.ptp(true)) or float(model.output_nominals()[output])
-    worst = float(np.max(np.abs(played - true))) / size
-    return worst if np.isfinite(worst) else float("inf")
 
 
 #: Substeps that are tried by default, and the error that is good enough.
@@ -262,8 +260,12 @@ def _check(name: str, step: float, precision: str, hold: str, substeps: int | No
             f"'{name}' cannot name functions in C; use letters, digits, underscores, no digit"
             " first."
         )
-    if not (np.isfinite(step) and step > 0.0):
-        raise InputError(f"The step is {step:g} s; give a time above 0, such as 10us.")
+    try:
+        positive = 0.0 < step < np.inf
+    except TypeError:  # a text
+        positive = False
+    if not positive:
+        raise InputError(f"The step is {step!r}; give seconds above 0, such as 1e-5.")
     if precision not in PRECISIONS:
         raise InputError(f"The precision '{precision}' is not known; choose double or single.")
     if hold not in _HELD:

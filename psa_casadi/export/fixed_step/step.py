@@ -51,15 +51,13 @@ _END = (2.255570073418735, 0.2870493262186792, 0.4353179431840180, 1.09350225240
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """A step of `step` [s] from time, states x and inputs u, which change by `du`.
+    """A step of `step` [s] from time, states x and inputs u of `of`, which change by `du`.
 
     `half` and `whole` are what the states known so far have changed by there.
     """
 
+    of: Structure
     step: float
-    time: Expression
-    x: Expression
-    u: Expression
     du: Expression
     half: Expression
     whole: Expression
@@ -77,12 +75,12 @@ def along_the_way(
     `driver` and `states` are indices, `rates` the driver's at start, half and end, `slopes` is the
     function (time, x, u, rate) of the states' derivatives.
     """
-    half, count = ends.half[driver], ends.x.numel()
+    s, half, count = ends.of, ends.half[driver], ends.of.x.numel()
     turned, share, turn = _turn(rates, half, ends.whole[driver], ends.step)
     # where the legs meet: parabolas in time, but for the driver
     change = 4.0 * share * (1.0 - share) * ends.half + share * (2.0 * share - 1.0) * ends.whole
-    parts = [ends.x[i] + change[i] for i in range(count)]
-    parts[driver] = ends.x[driver] + turn
+    parts = [s.x[i] + change[i] for i in range(count)]
+    parts[driver] = s.x[driver] + turn
     meeting = ca.vertcat(*parts)
 
     def shifted(x: Expression, moved: Expression) -> Expression:
@@ -109,11 +107,11 @@ def along_the_way(
         for i in states:
             parts[i] = origin[i]
         x = shifted(ca.vertcat(*parts), gone)
-        inputs = (ends.time + when * ends.step, x, ends.u + when * ends.du, rate)
+        inputs = (s.time + when * ends.step, x, s.u + when * ends.du, rate)
         return way, *rosenbrock(duration * slopes(*inputs), theta, gone)
 
-    first = leg(ends.x, meeting, ca.SX(0), share)
-    last = leg(shifted(meeting, first[2]), ends.x + ends.whole, share, 1.0 - share)
+    first = leg(s.x, meeting, ca.SX(0), share)
+    last = leg(shifted(meeting, first[2]), s.x + ends.whole, share, 1.0 - share)
     # at the half: a parabola over the way of the leg that it lies on
     inside = share > 0.5
     way, straight, moved = (ca.if_else(inside, a, b) for a, b in zip(first, last, strict=True))
@@ -228,16 +226,14 @@ SHARES = (0.5, 1.0)
 class StepExpression:
     """A step as expressions of its symbols; parameters are numbers.
 
-    From `time`, states `x` (nx,), inputs `u` (nu,) that change by `du` over the step and ports
-    `port` (np,) at the start follow the states' `change` (nx,) and the ports `port_end` (np,).
-    `low` (nx,) is what rounding took off `x`. `port_start` gives the ports from time, x and u.
+    From time, states x (nx,), inputs u (nu,), all of the model's structure, the inputs' change
+    `du` over the step and ports `port` (np,) at the start follow the states' `change` (nx,) and the
+    ports `port_end` (np,). `low` (nx,) is what rounding took off x. `port_start` gives the ports
+    from time, x and u.
     `port_names` are the states whose derivatives they are part of.
     """
 
-    time: Expression
-    x: Expression
     low: Expression
-    u: Expression
     du: Expression
     port: Expression
     change: Expression
@@ -288,7 +284,7 @@ class _Builder:
                 self._loop(members)
         start = [with_numbers(self.model, q.value) for q in split.ports]
         return StepExpression(
-            time=s.time, x=s.x, low=self.low, u=s.u, du=self.du, port=self.port,
+            low=self.low, du=self.du, port=self.port,
             change=self._change(WHOLE), port_end=self.ports[WHOLE],
             port_start=ca.vertcat(ca.SX(0, 1), *start),
             port_names=tuple(s.states[q.state].name for q in split.ports),
@@ -365,10 +361,7 @@ class _Builder:
         slopes = ca.Function(
             "slopes", [s.time, s.x, s.u, group.rate], [with_numbers(self.model, group.slopes)]
         )
-        ends = Ends(
-            step=self.step, time=s.time, x=s.x, u=s.u, du=self.du,
-            half=self._change(HALF), whole=self._change(WHOLE),
-        )  # fmt: skip
+        ends = Ends(s, self.step, self.du, self._change(HALF), self._change(WHOLE))
         result = along_the_way(ends, group.driver, group.states, self._rates(group.driver), slopes)
         for node, change in enumerate(result):
             for place, i in enumerate(group.states):
@@ -411,7 +404,7 @@ def step_of(model: Model, step: float) -> StepExpression | str:
         return ca.substitute(expression, still, ca.SX.zeros(still.numel()))
 
     return replace(
-        step_expression, u=s.u, du=step_expression.du[:count, 0],
+        step_expression, du=step_expression.du[:count, 0],
         change=resting(step_expression.change), port_end=resting(step_expression.port_end),
     )  # fmt: skip
 
@@ -439,7 +432,4 @@ def whole_step(model: Model, step: float) -> StepExpression:
     value = ca.substitute(step * with_numbers(model, s.xdot), ca.vertcat(s.time, s.x, s.u),
                           ca.vertcat(*there))  # fmt: skip
     _, change = rosenbrock(value, theta, gone) if n else (none, none)
-    return StepExpression(
-        time=s.time, x=s.x, low=low, u=s.u, du=du, port=none,
-        change=change, port_end=none, port_start=none, port_names=(),
-    )  # fmt: skip
+    return StepExpression(low, du, none, change, none, none, ())

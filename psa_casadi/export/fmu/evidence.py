@@ -60,8 +60,8 @@ def with_validity(model: Model) -> Model:
     if warm is not None:
         values |= {"seen_temperature_low": warm.low, "seen_temperature_high": warm.high}
     component = VALIDITY if warm is None else VALIDITY_WITH_TEMPERATURE
-    base = (c for c in model.components if c.gain is None)  # MODEL.json names them before effects
-    extended = model.with_components((*base, component, *model.effects)).with_values(values)
+    parts = (*model.base, component, *model.effects)  # MODEL.json names the base before effects
+    extended = model.with_components(parts).with_values(values)
     return replace(extended, evidence=model.evidence)
 
 

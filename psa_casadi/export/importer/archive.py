@@ -4,6 +4,7 @@ FMUs and SSPs come from anywhere: an archive is looked through before anything o
 """
 
 import math
+import os
 import re
 import stat
 import struct
@@ -161,7 +162,8 @@ class Archive:
             self._held.close()
             if isinstance(error, InputError):
                 raise
-            problem = f"{path}: cannot be read as an FMU ({error}); export it again."
+            reason = str(error).replace(f"{self.directory}{os.sep}", "")
+            problem = f"{path}: cannot be read as an FMU ({reason}); export it again."
             raise InputError(problem) from error
 
     def _read(self) -> None:
@@ -189,25 +191,20 @@ class Archive:
                 f"{self.path}: its model identifier {self.identifier!a} is no name in C; export it"
                 " again."
             )
-        self.references: dict[str, int] = {}
-        self.nominals: dict[str, float] = {}
-        self.bounds: dict[str, tuple[float, float]] = {}
-        for v in self.description.modelVariables:
-            self.references[v.name] = int(v.valueReference)
-            self.nominals[v.name] = 1.0 if v.nominal is None else float(v.nominal)
-            low = -math.inf if v.min is None else float(v.min)
-            self.bounds[v.name] = (low, math.inf if v.max is None else float(v.max))
-        self.variables = {v.name: v for v in self.description.modelVariables}
+        self.variables: dict[str, Any] = {v.name: v for v in self.description.modelVariables}
+        self.references = {n: int(v.valueReference) for n, v in self.variables.items()}
         self.elements = dict(self._elements())
-        for name, e in self.elements.items():
-            self.nominals[name] = self.nominals[e.variable]
-            self.bounds[name] = self.bounds[e.variable]
+        elements = {n: self.variables[e.variable] for n, e in self.elements.items()}
+        every = self.variables | elements
+        self.nominals = {n: _stated(v.nominal, 1.0) for n, v in every.items()}
+        self.bounds = {
+            n: (_stated(v.min, -math.inf), _stated(v.max, math.inf)) for n, v in every.items()
+        }
         self.step_size = self.experiment("stepSize") or 1e-3
         self._states = [str(u.variable.derivative.name) for u in self.description.derivatives]
         places = {name: k for k, name in enumerate(self._states)}
-        state_elements = [n for n, e in self.elements.items() if e.variable in places]
-        state_elements.sort(key=lambda n: places[self.elements[n].variable])
-        self.state_elements = state_elements
+        states = [n for n, e in self.elements.items() if e.variable in places]
+        self.state_elements = sorted(states, key=lambda n: places[self.elements[n].variable])
 
     def _read_flag(self) -> None:
         """Note that FMI 3.0 provides directional derivatives: fmpy reads the name of FMI 2.0."""
@@ -244,6 +241,10 @@ class Archive:
         kinds = ((1, self.description.coSimulation), (0, self.description.modelExchange))
         return tuple(kind for kind, announced in kinds if announced is not None)
 
+    def kind(self, interface: int) -> Any:
+        """Return what the description states of co-simulation (1) or model exchange (0)."""
+        return (self.description.modelExchange, self.description.coSimulation)[interface]
+
     def experiment(self, name: str) -> float:
         """Return a number of the default experiment by fmpy's name, 0 if there is none."""
         return float(getattr(self.description.defaultExperiment, name, None) or 0.0)
@@ -252,6 +253,11 @@ class Archive:
     def internal_step(self) -> float:
         """The fixed internal step of co-simulation [s], 0 if there is none."""
         return float(getattr(self.description.coSimulation, "fixedInternalStepSize", None) or 0.0)
+
+    @property
+    def takes_lines(self) -> bool:
+        """Whether the slope of an input over a step can be set in co-simulation."""
+        return bool(getattr(self.description.coSimulation, "canInterpolateInputs", False))
 
     @property
     def token(self) -> str:
@@ -287,6 +293,11 @@ class Archive:
         for path in sorted((self.directory / "binaries").rglob("*")):
             if path.is_file() and path.suffix in (".so", ".dll", ".dylib"):
                 yield path
+
+
+def _stated(value: Any, other: float) -> float:
+    """Return a number of the description, another one where it states none."""
+    return other if value is None else float(value)
 
 
 def _size(dimension: Any) -> int:

@@ -72,7 +72,8 @@ class Fmu(Archive):
         binary = next((p for p in places if p.is_file()), None)
         if binary is None:
             raise InputError(
-                f"{self.path}: has no binary for this machine; export it for this platform."
+                f"{self.path}: has no binary for this machine, binaries/{folders[0]}/{name}; export"
+                " it for this platform."
             )
         try:
             with chdir("."):  # fmpy does not leave the folder of a library that does not load
@@ -232,9 +233,10 @@ class Instance:
             whole = every if real else [int(v) for v in np.rint(every)]
             getattr(self.fmi, f"set{g.type}")(g.references, whole)
 
-    def step(self, point: float, size: float) -> None:
-        """Do one communication step."""
-        self.fmi.doStep(point, size)
+    def step(self, point: float, size: float) -> bool:
+        """Do one communication step; return whether the FMU ends the simulation (FMI 3.0)."""
+        done = self.fmi.doStep(point, size)
+        return bool(done and done[1])
 
     def set_rates(self, rates: Mapping[str, float]) -> None:
         """Set the time derivatives of inputs for the next communication step (FMI 2.0 only)."""

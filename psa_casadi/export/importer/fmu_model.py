@@ -17,14 +17,14 @@ from psa_casadi.common.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.common.units import parse_unit
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.imported import (
-    TIME_EVENT,
     Imported,
     Selected,
+    TimeEventError,
     digest_of,
     imported_of,
     opened,
 )
-from psa_casadi.export.importer.played import Played, PlayedEquations
+from psa_casadi.export.importer.played import Passed, Played
 from psa_casadi.model.component import Component, Equations, Expression, FmuUsed, Foreign, Symbols
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.model_file import model_of, no_fmu, read_content
@@ -284,18 +284,15 @@ def fmu_model(
     fmu = opened(file.resolve(), digest)
     chosen = None if interface is None else _interface(fmu, interface)
     if chosen != CO_SIMULATION and _has_equations(fmu):
-        with suppress(_TimeEventError):
+        with suppress(TimeEventError):
             return _of_equations(fmu, digest, free, values or {}, name)
     chosen = _interface(fmu, None) if chosen is None else chosen
     read = read_variables(fmu, free, values or {}, whole=True)
-    s, names = read.selected, (p.name for p in read.parameters)
-    played = Played(
-        str(file.resolve()), digest, chosen, s.inputs, s.outputs,
-        tuple(zip(names, s.parameters, strict=True)), s.fixed,
-    )  # fmt: skip
+    s, names = read.selected, tuple(p.name for p in read.parameters)
+    played = Played(str(file.resolve()), digest, chosen, s, names)
     used = FmuUsed(file.name, digest, s.parameters, dict(s.fixed), _NAMES[chosen])
     foreign = Foreign(f"fmu_{digest[:16]}", _no_function, used, str(file.resolve()))
-    equations = PlayedEquations(tuple(o.name for o in read.outputs))
+    equations = Passed(tuple((o.name, "") for o in read.outputs))
     return _composed(fmu, read, equations, foreign, name, played)
 
 
@@ -333,10 +330,6 @@ def _composed(
     return compose([component], name=name)
 
 
-class _TimeEventError(Exception):
-    """An FMU has events at times, which only its initialisation shows."""
-
-
 def _of_equations(
     fmu: Fmu, digest: str, free: Free | None, values: Mapping[str, float], name: str | None
 ) -> Model:
@@ -347,9 +340,9 @@ def _of_equations(
     try:
         with imported.initialised(declared) as instance:
             starts = instance.vector("GetContinuousStates", len(read.states)).tolist()
+    except (InputError, TimeEventError):  # of the file, not of its values
+        raise
     except PsaError as error:
-        if str(error) == TIME_EVENT:
-            raise _TimeEventError from error
         raise InputError(f"{fmu.path}: cannot be initialised ({error}); check `values`.") from error
     equations = _FmuEquations(imported, read, _definitions(imported, read))
     model = _composed(fmu, read, equations, imported.foreign, name)

@@ -26,8 +26,6 @@ from psa_casadi.model.component import FmuUsed, Foreign
 from psa_casadi.simulation.compiler import shared_library
 
 _PREPARE = ctypes.CFUNCTYPE(c_void_p, c_int, c_int, ctypes.POINTER(c_double))
-#: The message for an FMU with events at times.
-TIME_EVENT = "the FMU announces an event at a time of its own"
 #: Functions of `psa_imported` by version: name of a field, name in the standard.
 _BOTH = {"set_time": "SetTime", "set_states": "SetContinuousStates"}
 _FUNCTIONS = {
@@ -35,6 +33,10 @@ _FUNCTIONS = {
     3: {**_BOTH, "get_rates": "GetContinuousStateDerivatives", "set_real3": "SetFloat64",
         "get_real3": "GetFloat64"},
 }  # fmt: skip
+
+
+class TimeEventError(FmuError):
+    """An FMU has events at times, which only its initialisation shows."""
 
 
 class _ImportedFmu(ctypes.Structure):
@@ -144,7 +146,7 @@ class Imported:
             old.require("Reset")
         instance.setup(values={**dict(self.selected.fixed), **parameters})
         if instance.leave_event_mode() < math.inf:
-            raise FmuError(TIME_EVENT)
+            raise TimeEventError("the FMU announces an event at a time of its own")
         return instance
 
     def _prepared(self, slot: int, place: int, p: "ctypes._Pointer[c_double]") -> int | None:

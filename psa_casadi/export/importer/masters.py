@@ -1,22 +1,44 @@
-"""Two small importers of one FMU: stepping it (co-simulation), integrating it (model exchange)."""
+"""Runs of one FMU over a record: stepped (co-simulation), or integrated (model exchange).
 
-from collections.abc import Callable, Sequence
+Model exchange has its events, and inputs as they are at every time at which the solver, fmpy's
+CVode, asks for rates.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import numpy as np
-import scipy
+from fmpy.sundials import CVodeSolver
 
 from psa_casadi.common.files import temporary_folder
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.fmu.archive import export_fmu
-from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu, FmuError, Instance
+from psa_casadi.export.importer.fmu import (
+    CO_SIMULATION,
+    MODEL_EXCHANGE,
+    NO_MESSAGE,
+    Fmu,
+    FmuError,
+    Instance,
+)
+from psa_casadi.export.importer.imported import opened
 from psa_casadi.model.compose import Model
 from psa_casadi.simulation.start import start_state
 
+#: Relative tolerance of a run by model exchange; CVode's.
+_TOLERANCE = 1e-7
+#: Steps of the solver between two samples, at most.
+_MOST_STEPS = 10_000
+#: Intervals that differ by this share are the same; times that differ by this share of a run are.
+_SAME, _SAME_TIME = 1e-6, 1e-12
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class Signals:
     """Inputs that are linear between knots: `times` (k,), `values` (k, nu), columns as `names`.
 
@@ -33,7 +55,8 @@ class Signals:
         wanted = np.atleast_1d(np.asarray(times, dtype=float))
         if self.held:
             side: Literal["left", "right"] = "left" if before else "right"
-            rows = np.searchsorted(self.times, wanted, side) - 1
+            rounded = wanted if before else wanted * (1 + _SAME_TIME) + 1e-15
+            rows = np.searchsorted(self.times, rounded, side) - 1
             return self.values[np.maximum(rows, 0)]
         columns = [np.interp(wanted, self.times, column) for column in self.values.T]
         return np.array(columns).reshape(len(self.names), len(wanted)).T
@@ -42,110 +65,184 @@ class Signals:
         """Return the signals sampled at times: what an importer that samples them passes on."""
         return Signals(self.names, times, self.at(times), self.held)
 
+    def named(self, values: FloatArray) -> dict[str, float]:
+        """Return values (nu,) of the inputs by name."""
+        return dict(zip(self.names, values.tolist(), strict=True))
+
 
 def communicate(
-    instance: Instance,
-    times: FloatArray,
-    inputs: Signals,
-    outputs: Sequence[str],
-    *,
-    settled: bool = False,
-) -> FloatArray:
+    instance: Instance, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
+    settled: bool = False, centred: bool = False,
+) -> FloatArray:  # fmt: skip
     """Step an initialised instance over communication points (n,); return outputs (n, ny).
 
     Inputs are set at the start of each step; their slope over the step is set too unless they are
-    held, or FMI 3.0 has no way to. Outputs are read at the end of each step, and at the start; with
-    `settled` after the inputs of that time are set, which counts where these jump.
+    held, or the FMU takes none. Then, `centred`, their value at the middle of the step is set: held
+    at that of its beginning, as importers do, they are late by half a step. Outputs are read at the
+    end of each step, and at the start; with `settled` after the inputs of that time are set, which
+    counts where these jump. Raises FmuError, also where the FMU ends the simulation.
     """
-    samples = inputs.at(times)
-    names = inputs.names
-    result = np.empty((len(times), len(outputs)))
-    instance.set(dict(zip(names, samples[0], strict=True)))
-    result[0] = instance.get(outputs)
-    for k, (begin, end) in enumerate(pairwise(times)):
-        size = float(end - begin)
-        instance.set(dict(zip(names, samples[k], strict=True)))
-        if instance.fmu.version == 2 and not inputs.held:
-            slope = (samples[k + 1] - samples[k]) / size
-            instance.set_rates(dict(zip(names, slope, strict=True)))
-        instance.step(float(begin), size)
+    at, lines = inputs.at(times), instance.fmu.takes_lines and not inputs.held
+    during = at[:-1]
+    if centred and not lines:
+        during = inputs.at(0.5 * (times[:-1] + times[1:]))
+    instance.set(inputs.named(at[0]))
+    rows = [instance.get(outputs)]
+    for k, (begin, end) in enumerate(pairwise(times.tolist())):
+        instance.set(inputs.named(during[k]))
+        if lines and inputs.names:
+            instance.set_rates(inputs.named((at[k + 1] - at[k]) / (end - begin)))
+        if instance.step(begin, end - begin):
+            raise FmuError(f"the FMU ends the simulation at {end:g} s")
         if settled:
-            instance.set(dict(zip(names, samples[k + 1], strict=True)))
-        result[k + 1] = instance.get(outputs)
-    return result
+            instance.set(inputs.named(at[k + 1]))
+        rows.append(instance.get(outputs))
+    return np.array(rows)
 
 
 def co_simulate(
     fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
-    tolerance: float | None = None, values: dict[str, float] | None = None, settled: bool = False,
+    tolerance: float | None = None, values: Mapping[str, float] | None = None,
+    settled: bool = False, centred: bool = False, **options: Any,
 ) -> FloatArray:  # fmt: skip
     """Run a new co-simulation instance over communication points; return outputs (n, ny)."""
-    start = float(times[0])
-    with fmu.start(CO_SIMULATION, tolerance=tolerance, values=values, start_time=start) as instance:
-        return communicate(instance, times, inputs, outputs, settled=settled)
+    with fmu.open(CO_SIMULATION, **options) as instance:
+        instance.setup(tolerance=tolerance, values=values, start_time=float(times[0]))
+        return communicate(instance, times, inputs, outputs, settled=settled, centred=centred)
+
+
+class _Solver(CVodeSolver):  # type: ignore[misc]
+    """fmpy's CVode, with the inputs of the time at which it asks for rates."""
+
+    def f(self, t: float, y: Any, ydot: Any, data: Any) -> int:
+        """Set the inputs, then compute the rates: fmpy's has those of the step's beginning."""
+        self.set_time(t)
+        self.input.apply(t)
+        return int(super().f(t, y, ydot, data))
 
 
 def integrate(
-    fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *, tolerance: float,
-    values: dict[str, float] | None = None,
+    fmu: Fmu, times: FloatArray, inputs: Signals, outputs: Sequence[str], *,
+    tolerance: float = _TOLERANCE, values: Mapping[str, float] | None = None, **options: Any,
 ) -> FloatArray:  # fmt: skip
-    """Integrate a new model exchange instance with LSODA, restarted at every knot of the inputs.
+    """Integrate a new model exchange instance, with its events; return outputs (n, ny) at `times`.
 
-    Returns the outputs (n, ny) at `times`, at an event those after it. The error of a step is held
-    below tolerance (|state| + nominal / 100). It restarts at the FMU's time events too.
+    At an event of the FMU they are those after it, at a jump of held inputs those before it. Raises
+    FmuError, also where the FMU ends the simulation.
     """
-    start = float(times[0])
-    with fmu.open(MODEL_EXCHANGE) as instance:
-        instance.setup(start_time=start, values=values)
-        instance.set(dict(zip(inputs.names, inputs.at(start)[0], strict=True)))
-        event = instance.leave_event_mode()
-        states = fmu.states()
-        x = instance.get(states)
-        atol = 1e-2 * tolerance * np.array([fmu.nominals[s] for s in states])
+    held, same, now = inputs.held, _SAME_TIME * (times[-1] - times[0]), float(times[0])
+    starts = inputs.named(inputs.at(now)[0])
+    with fmu.open(MODEL_EXCHANGE, **options) as instance:
+        instance.setup(start_time=now, values={**(values or {}), **starts})
+        event, fmi = instance.leave_event_mode(), instance.fmi
+        two, exchange = fmu.version == 2, fmu.description.modelExchange
+        finished = getattr(exchange, "completedIntegratorStepNotNeeded", None)
+        needed = bool(exchange.needsCompletedIntegratorStep) and not finished
 
-        def rates(t: float, x: FloatArray) -> FloatArray:
-            return instance.derivatives(t, x, dict(zip(inputs.names, inputs.at(t)[0], strict=True)))
+        def apply(t: float, *, event: bool = False) -> None:
+            """Set the inputs of a time; held ones only at events."""
+            if inputs.names and (event or not held):
+                instance.set(inputs.named(inputs.at(t)[0]))
 
-        def read(t: float, x: FloatArray) -> FloatArray:
-            rates(t, x)
-            return instance.get(outputs)
-
-        rows = [read(start, x)]
-        inside = inputs.times[(inputs.times > times[0]) & (inputs.times < times[-1])]
-        knots, now = [*inside, float(times[-1])], start
-        same = 1e-12 * (times[-1] - times[0])  # times that differ only by rounding
-        while knots:
-            stop = event if event <= knots[0] + same else knots[0]
-            wanted = times[len(rows) :][times[len(rows) :] < stop - same]
-            points = [(t, x) for t in (*wanted, stop)]
-            if states:
-                points = _solved(rates, (now, stop), x, tolerance, atol, wanted)
-            rows += [read(float(t), s) for t, s in points[:-1]]
-            now, x = stop, points[-1][1]
-            rates(now, x)
-            after = inputs.at(max(now, min(knots[0], now + same)))[0]
-            instance.set(dict(zip(inputs.names, after, strict=True)))
-            if now == event:
-                instance.require("EnterEventMode")
-                event = instance.leave_event_mode()
-            if len(rows) < len(times) and times[len(rows)] <= now + same:
+        solver = _Solver(
+            nx=len(fmu.state_elements), nz=fmu.indicator_count(),
+            get_x=fmi.getContinuousStates, set_x=fmi.setContinuousStates,
+            get_dx=fmi.getDerivatives if two else fmi.getContinuousStateDerivatives,
+            get_z=fmi.getEventIndicators, get_nominals=fmi.getNominalsOfContinuousStates,
+            set_time=fmi.setTime, input=SimpleNamespace(apply=apply), startTime=now,
+            maxStep=float(times[-1] - times[0]) / 50.0, relativeTolerance=tolerance,
+            maxNumSteps=_MOST_STEPS,
+        )  # fmt: skip
+        rows = [instance.get(outputs)]
+        for target in times[1:].tolist():
+            while now < target - same:
+                happened, _, now = solver.step(now, min(target, event))
+                fmi.setTime(now)
+                apply(now)
+                wants_event, ends = fmi.completedIntegratorStep() if needed else (False, False)
+                if ends:
+                    raise FmuError(f"the FMU ends the simulation at {now:g} s")
+                jumps = held and now >= target - same
+                if jumps:
+                    rows.append(instance.get(outputs))
+                if happened or wants_event or jumps or now >= event - same:
+                    instance.require("EnterEventMode")
+                    apply(now, event=True)
+                    event = instance.leave_event_mode()
+                    solver.reset(now)
+            if not held:
                 rows.append(instance.get(outputs))
-            knots = [k for k in knots if k > now + same]
         return np.array(rows)
 
 
-def _solved(
-    rates: Callable[[float, FloatArray], FloatArray], span: tuple[float, float], x: FloatArray,
-    tolerance: float, atol: FloatArray, wanted: FloatArray,
-) -> list[tuple[float, FloatArray]]:  # fmt: skip
-    """Return times and states at the wanted times of a span, and at its end."""
-    solution = scipy.integrate.solve_ivp(
-        rates, span, x, method="LSODA", rtol=tolerance, atol=atol,
-        t_eval=np.union1d(wanted, [span[1]]),
-    )  # fmt: skip
-    if not solution.success:
-        raise FmuError(f"model exchange stopped after {span[0]:g} s: {solution.message}")
-    return list(zip(solution.t, solution.y.T, strict=True))
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What an FMU is to do: values before its initialization, inputs, whose knots are the samples.
+
+    `interface` is `CO_SIMULATION` or `MODEL_EXCHANGE`. A step of co-simulation is divided into
+    `parts`.
+    """
+
+    file: str
+    digest: str
+    interface: int
+    outputs: tuple[str, ...]
+    values: Mapping[str, float]
+    inputs: Signals
+    parts: int = 1
+
+
+def play(run: Run) -> FloatArray | str:
+    """Return the outputs (n, ny) at the times of a run, or why there are none."""
+    reason = ""
+    for options in ({}, {"loggingOn": True}):  # some give the reason only with logging
+        try:
+            fmu = opened(Path(run.file), run.digest)
+            if run.interface == CO_SIMULATION:
+                return stepped(fmu, run, **options)
+            times = run.inputs.times
+            return integrate(fmu, times, run.inputs, run.outputs, values=run.values, **options)
+        except Exception as error:  # noqa: BLE001 - of an FMU and of fmpy, any
+            reason = str(error) or type(error).__name__
+        if NO_MESSAGE not in reason:
+            break
+    return reason
+
+
+def stepped(fmu: Fmu, run: Run, **options: Any) -> FloatArray:
+    """Step a new instance over a run. Raises FmuError."""
+    inputs, outputs = run.inputs, run.outputs
+    points = communication_points(fmu, inputs.times, run.parts)
+    values = {**run.values, **inputs.named(inputs.values[0])}
+    rows = co_simulate(
+        fmu, points, inputs, outputs, values=values, settled=True, centred=True, **options
+    )
+    return Signals(outputs, points, rows).at(inputs.times)
+
+
+def communication_points(fmu: Fmu, t: FloatArray, parts: int = 1) -> FloatArray:
+    """Return the communication points of a run over times t (n,).
+
+    They are the times, more where the FMU's default step is shorter, and `parts` points in each
+    step; multiples of its internal step, or of one interval, where the FMU takes no other ones.
+    """
+    gaps = np.diff(t)
+    if not len(gaps):
+        return t
+    most = min(fmu.experiment("stepSize") or math.inf, float(np.max(gaps))) / parts
+    internal, middle = fmu.internal_step, float(np.median(gaps))
+    even = bool(np.ptp(gaps) <= _SAME * middle)
+    if internal:
+        size = internal * max(1, math.floor(middle / parts / internal * (1 + _SAME)))
+    elif fmu.description.coSimulation.canHandleVariableCommunicationStepSize:
+        counts = np.ceil(gaps / most * (1 - _SAME)).astype(int).clip(1)
+        inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(t, t[1:], counts)]  # noqa: B905
+        return np.concatenate([*inner, t[-1:]])
+    else:
+        least = middle if even else float(np.min(gaps))
+        size = least / math.ceil(least / most * (1 - _SAME) or 1)
+    count = math.ceil((t[-1] - t[0]) / size * (1 - _SAME))
+    return np.asarray(t[0] + size * np.arange(count + 1))
 
 
 def played_on_fmu(

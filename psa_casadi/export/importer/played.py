@@ -10,10 +10,8 @@ for each, and none for effects of outputs. What was run once is not run again.
 import atexit
 import hashlib
 import threading
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -27,7 +25,8 @@ from psa_casadi.common.processes import Processes
 from psa_casadi.common.symbolic import in_turn
 from psa_casadi.common.units import FloatArray
 from psa_casadi.export.importer.fmu import CO_SIMULATION
-from psa_casadi.export.importer.play import Run, play
+from psa_casadi.export.importer.imported import Selected
+from psa_casadi.export.importer.masters import Run, Signals, play
 from psa_casadi.model.component import Component, Equations, Expression, Symbols
 from psa_casadi.model.compose import Model, Structure
 from psa_casadi.model.ports import Opened, ported
@@ -60,49 +59,38 @@ PLAYED, GIVEN = "played_", "given_"
 class Played:
     """An FMU that is run as a whole: its file, and its variables in the order of the model's.
 
-    `parameters` are by the model's names; `fixed` are values of further ones.
+    `names` are those of its parameters in the model.
     """
 
     file: str
     digest: str
     interface: int
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    parameters: tuple[tuple[str, str], ...]
-    fixed: tuple[tuple[str, float], ...]
+    selected: Selected
+    names: tuple[str, ...]
 
-    def outputs_of(
-        self, wanted: Sequence[tuple[Mapping[str, float], FloatArray]], t: FloatArray, hold: str,
-        parts: int,
-    ) -> list[FloatArray]:  # fmt: skip
-        """Return the outputs (n, ny) for values of parameters and inputs (n, nu), by processes.
-
-        Each step of co-simulation is divided into `parts`. Raises SimulationError with the
-        FMU's message.
-        """
-        return RUNS.of([self._of(values, u, t, hold, parts) for values, u in wanted])
-
-    def _of(
-        self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str, parts: int
+    def play(
+        self, values: Mapping[str, float], t: FloatArray, u: FloatArray, hold: str, parts: int = 1
     ) -> Run:
-        starts = {**dict(self.fixed), **{n: values[name] for name, n in self.parameters}}
-        fmu = self.file, self.digest, self.interface, self.inputs, self.outputs
-        return Run(*fmu, starts, t, u, hold, parts)
+        """Return a run with values of parameters and inputs (n, nu), each step in `parts`."""
+        s = self.selected
+        starts = zip(s.parameters, (values[n] for n in self.names), strict=True)
+        inputs = Signals(s.inputs, t, u, hold == "zero")
+        what = s.outputs, {**dict(s.fixed), **dict(starts)}, inputs, parts
+        return Run(self.file, self.digest, self.interface, *what)
 
-    def _parts(self, values: Mapping[str, float], u: FloatArray, t: FloatArray, hold: str) -> int:
-        """Return into how many parts a step of co-simulation is divided with these inputs.
+    def _parts(self, run: Run) -> int:
+        """Return into how many parts a step of co-simulation is divided with the inputs of a run.
 
         It is decided once for a record, at the first values: as many as it takes until twice as
         many change no output by more than a small share of its standard deviation.
         """
         if self.interface != CO_SIMULATION:
             return 1
-        key = _key(self._of(dict.fromkeys(values, 0.0), u, t, hold, 1))
+        key = _key(replace(run, values=dict(self.selected.fixed)))
         if key not in _PARTS:
-            parts = 1
-            (before,) = RUNS.of([self._of(values, u, t, hold, parts)])
+            parts, (before,) = 1, RUNS.of([run])
             while parts < _MOST_PARTS:
-                (after,) = RUNS.of([self._of(values, u, t, hold, 2 * parts)])
+                (after,) = RUNS.of([replace(run, parts=2 * parts)])
                 size = np.maximum(np.std(after, axis=0), 1e-300)
                 if np.max(np.sqrt(np.mean((after - before) ** 2, axis=0)) / size) < _SETTLED:
                     break
@@ -143,26 +131,27 @@ class Played:
                 outputs=texts,
             )  # fmt: skip
 
-        silent = np.zeros((len(t), len(self.outputs)))
+        silent = np.zeros((len(t), len(self.selected.outputs)))
         before = around(silent, inputs, unknowns)
         applied = before.y[:, [names.index(n) for n in inputs]]
         kept = hold if not _filtered(inner.structure) else "linear"
         moved = [
             k
             for k, q in enumerate(unknowns)
-            if q in dict(self.parameters) or np.any(before.sensitivity[:, :, k])
+            if q in self.names or np.any(before.sensitivity[:, :, k])
         ]
         steps = {k: _step(inner, unknowns[k], at) for k in moved}
 
-        def changed(k: int, side: int) -> tuple[Mapping[str, float], FloatArray]:
-            """Return values and inputs with a step of an unknown to one side."""
+        parts = self._parts(self.play(at, t, u, kept))
+
+        def changed(k: int, side: int) -> Run:
+            """Return the run with a step of an unknown to one side."""
             q, h = unknowns[k], side * steps[k]
             new = {**at, q: at[q] + h} if isinstance(q, str) else at
-            return new, applied + h * before.sensitivity[:, :, k]
+            return self.play(new, t, applied + h * before.sensitivity[:, :, k], kept, parts)
 
-        parts = self._parts(at, u, t, kept)
-        plain, *others = self.outputs_of(
-            [(at, applied), *(changed(k, 1) for k in moved)], t, kept, parts
+        plain, *others = RUNS.of(
+            [self.play(at, t, applied, kept, parts), *(changed(k, 1) for k in moved)]
         )
         result = around(plain, wanted, unknowns)
         rows = [names.index(n) for n in wanted]
@@ -172,7 +161,7 @@ class Played:
 
         slopes = {k: slope(k, 1, y) for k, y in zip(moved, others, strict=True)}
         jumping = [k for k in moved if _jumps(slopes[k])]
-        back = self.outputs_of([changed(k, -1) for k in jumping], t, kept, parts)
+        back = RUNS.of([changed(k, -1) for k in jumping])
         for k, y in zip(jumping, back, strict=True):
             slopes[k] = _lesser(slopes[k], slope(k, -1, y))
         sensitivity = result.sensitivity.copy()
@@ -208,27 +197,16 @@ def _step(model: Model, unknown: str | int, values: Mapping[str, float]) -> floa
 
 
 @dataclass(frozen=True, eq=False)
-class PlayedEquations:
-    """The equations of an FMU that is run as a whole: none. Its outputs are 0 here."""
+class Passed:
+    """Outputs with the inputs that they are, 0 without one; `still` is a state that stays."""
 
-    outputs: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    still: str = ""
 
     def __call__(self, s: Symbols) -> Equations:
         """Return the equations."""
-        return Equations(out={n: ca.SX(0) for n in self.outputs})
-
-
-@dataclass(frozen=True, eq=False)
-class _InnerEquations:
-    """Outputs that are played to a model, and the inputs as they are applied."""
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-
-    def __call__(self, s: Symbols) -> Equations:
-        expressions: dict[str, Expression] = {GIVEN + n: getattr(s, n) for n in self.inputs}
-        table = {n: getattr(s, PLAYED + n) for n in self.outputs}
-        return Equations(out={**table, **expressions})
+        out: dict[str, Expression] = {o: getattr(s, i) if i else ca.SX(0) for o, i in self.pairs}
+        return Equations(out=out, der={self.still: ca.SX(0)} if self.still else {})
 
 
 def inner_of(model: Model) -> Model:
@@ -250,11 +228,14 @@ def inner_of(model: Model) -> Model:
 def _inner(component: Component) -> Component:
     opened = component.equations if isinstance(component.equations, Opened) else None
     inputs, outputs = component.inputs, component.outputs
+    played = [Input(PLAYED + o.name, o.unit, o.description) for o in outputs]
+    given = [Output(GIVEN + i.name, i.unit, i.description) for i in inputs]
+    pairs = [*zip(outputs, played, strict=True), *zip(given, inputs, strict=True)]
     plain = replace(
         opened.component if opened else component,
-        equations=_InnerEquations(tuple(i.name for i in inputs), tuple(o.name for o in outputs)),
-        inputs=(*inputs, *(Input(PLAYED + o.name, o.unit, o.description) for o in outputs)),
-        outputs=(*outputs, *(Output(GIVEN + i.name, i.unit, i.description) for i in inputs)),
+        equations=Passed(tuple((o.name, i.name) for o, i in pairs)),
+        inputs=(*inputs, *played),
+        outputs=(*outputs, *given),
         foreign=None,
         played=None,
     )
@@ -272,17 +253,20 @@ def _loops(structure: Structure) -> bool:
     )
     hit = [k for k, rate in enumerate(ca.vertsplit(structure.xdot)) if ca.depends_on(rate, played)]
     behind = [k for k in range(structure.x.numel()) if any(k == j or reach[k, j] for j in hit)]
-    reached = ca.vertcat(played, structure.x[behind])
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
-    return bool(rows and reached.numel() and ca.depends_on(structure.y[rows], reached))
+    return _inputs_depend(structure, ca.vertcat(played, structure.x[behind]))
 
 
 @cache
 @in_turn
 def _filtered(structure: Structure) -> bool:
     """Whether inputs of an FMU depend on states, so that held inputs are not held there."""
+    return _inputs_depend(structure, structure.x)
+
+
+def _inputs_depend(structure: Structure, symbols: Expression) -> bool:
+    """Whether inputs of an FMU depend on symbols."""
     rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
-    return bool(rows and structure.x.numel() and ca.depends_on(structure.y[rows], structure.x))
+    return bool(rows and symbols.numel() and ca.depends_on(structure.y[rows], symbols))
 
 
 class _Runs:
@@ -293,38 +277,29 @@ class _Runs:
 
     def __init__(self) -> None:
         self.count = self.samples = 0
-        self._kept: OrderedDict[str, FloatArray | str] = OrderedDict()
+        self._kept: dict[str, Future[Any]] = {}
         self._processes: Processes | None = None
         self._lock = threading.Lock()
 
     def of(self, runs: Iterable[Run]) -> list[FloatArray]:
         """Return the outputs of runs. Raises SimulationError."""
-        wanted = [(_key(r), r) for r in runs]
-        by_key = dict(wanted)
+        futures = []
         with self._lock:
-            new = {k: self._submitted(r) for k, r in by_key.items() if k not in self._kept}
-            table: dict[str, FloatArray | str] = {k: self._kept[k] for k in by_key if k not in new}
+            for wanted in runs:
+                key = _key(wanted)
+                if key not in self._kept:
+                    self._kept[key] = self._submitted(wanted)
+                futures.append(self._kept[key])
+            for key in list(self._kept)[:-_KEPT]:
+                del self._kept[key]
         try:
-            for key, future in new.items():
-                table[key] = _waited(future)
+            return [_waited(future) for future in futures]
         except KeyboardInterrupt:
             self.end()
             raise
-        with self._lock:
-            for key in new:
-                self._kept[key] = table[key]
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        outputs = []
-        for key, _ in wanted:
-            result = table[key]
-            if isinstance(result, str):
-                raise SimulationError(f"The FMU could not be simulated: {result}")
-            outputs.append(result)
-        return outputs
 
-    def _submitted(self, wanted: Run) -> "Future[Any]":
-        self.count, self.samples = self.count + 1, self.samples + len(wanted.t)
+    def _submitted(self, wanted: Run) -> Future[Any]:
+        self.count, self.samples = self.count + 1, self.samples + len(wanted.inputs.times)
         if self._processes is None:
             self._processes = Processes(threads(), again=True)
             atexit.register(self.end)
@@ -335,29 +310,33 @@ class _Runs:
         self._kept.clear()
 
     def end(self) -> None:
-        """End the processes."""
+        """End the processes, and forget."""
+        self.forget()
         if self._processes is not None:
             self._processes.end()
             self._processes = None
 
 
-def _waited(future: "Future[Any]") -> FloatArray | str:
-    """Return what comes of a run, in numbers or words. Raises KeyboardInterrupt."""
-    while True:
-        with suppress(TimeoutError):
-            try:
-                result: FloatArray | str = future.result(timeout=_LOOK)
-            except MachineError as error:
-                return str(error)
-            if isinstance(result, str):
-                return result
-            return result if np.isfinite(result).all() else "its outputs are not finite"
-        raise_if_stopped()
+def _waited(future: Future[Any]) -> FloatArray:
+    """Return what comes of a run. Raises SimulationError, KeyboardInterrupt."""
+    result: FloatArray | str | None = None
+    while result is None:
+        try:
+            result = future.result(timeout=_LOOK)
+        except TimeoutError:
+            raise_if_stopped()
+        except MachineError as error:
+            result = str(error)
+    if isinstance(result, str) or not np.isfinite(result).all():
+        why = result if isinstance(result, str) else "its outputs are not finite"
+        raise SimulationError(f"The FMU could not be simulated: {why}")
+    return result
 
 
 def _key(r: Run) -> str:
-    what = (r.file, r.digest, r.interface, r.inputs, r.outputs, r.values, r.hold, r.parts)
-    return hashlib.sha256(repr(what).encode() + r.t.tobytes() + r.u.tobytes()).hexdigest()
+    i = r.inputs
+    what = (r.file, r.digest, r.interface, i.names, r.outputs, r.values, i.held, r.parts)
+    return hashlib.sha256(repr(what).encode() + i.times.tobytes() + i.values.tobytes()).hexdigest()
 
 
 RUNS = _Runs()

@@ -9,15 +9,20 @@ from functools import cached_property
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-from psa_casadi.common.errors import InputError, PsaError
+import numpy as np
+
+from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_path, atomic_write
 from psa_casadi.common.notes import Note, note
 from psa_casadi.export.common.parameter_sets import parameter_rows, set_text
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import Fmu
 from psa_casadi.export.importer.imported import digest_of, opened
+from psa_casadi.export.importer.masters import Run, Signals
+from psa_casadi.export.importer.played import RUNS
 from psa_casadi.model.component import Component, Foreign
 from psa_casadi.model.compose import Model
+from psa_casadi.simulation.stepper import SimulationError
 
 _DESCRIPTION = "modelDescription.xml"
 #: Values that differ by this share are the same: those of a Float32.
@@ -76,7 +81,7 @@ def save_start_values(model: Model, path: str | os.PathLike[str]) -> tuple[Note,
         raise InputError(f"{target}: start values are written to NAME.fmu or NAME.ssv; name it so.")
     with atomic_path(target) as temporary:
         _copy(part.fmu, temporary, part.values)
-    return _notes_on_binary(target, part.values)
+    return _notes_on_binary(target, part)
 
 
 def start_set(part: FmuPart) -> str:
@@ -125,15 +130,18 @@ def _with_starts(content: bytes, starts: Mapping[str, str]) -> bytes:
     return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
-def _notes_on_binary(path: Path, values: Mapping[str, float]) -> tuple[Note, ...]:
+def _notes_on_binary(path: Path, part: FmuPart) -> tuple[Note, ...]:
     """Return the note that the binary of an FMU starts with other values than its description."""
+    names, nothing = tuple(part.values), Signals((), np.zeros(1), np.zeros((1, 0)))
+    file = path.resolve()
+    start = Run(str(file), digest_of(file), part.fmu.interfaces()[0], names, {}, nothing)
     try:
-        with Fmu(path) as fmu, fmu.open(fmu.interfaces()[0]) as instance:
-            instance.setup()
-            read = instance.get(list(values))
-    except PsaError:
+        (read,) = RUNS.of([start])
+    except SimulationError:
         return ()
     other = [
-        n for (n, v), r in zip(values.items(), read, strict=True) if abs(r - v) > _SAME * abs(v)
+        n
+        for (n, v), r in zip(part.values.items(), read[0], strict=True)
+        if abs(r - v) > _SAME * abs(v)
     ]
     return (note("starts_in_binary", names=tuple(other)),) if other else ()

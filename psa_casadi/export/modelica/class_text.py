@@ -27,8 +27,14 @@ from psa_casadi.export.modelica.expression import (
 )
 from psa_casadi.model.component import Expression, Symbols
 from psa_casadi.model.compose import Model
-from psa_casadi.model.scales import static_stiffness, stroke
-from psa_casadi.model.shapes import direction, magnitude_power, rate_magnitude, signed_power
+from psa_casadi.model.shapes import (
+    direction,
+    magnitude_power,
+    rate_magnitude,
+    signed_power,
+    static_stiffness,
+    stroke,
+)
 from psa_casadi.model.structure import Structure
 from psa_casadi.model.variables import Input, Output, Parameter, State, nominal_value
 

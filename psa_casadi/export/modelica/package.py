@@ -37,8 +37,8 @@ from psa_casadi.export.modelica.expression import (
     unit_text,
 )
 from psa_casadi.model.compose import Model
-from psa_casadi.model.effects.mechanics import RECIPROCAL_COUPLING
-from psa_casadi.model.scales import stiffness_scale
+from psa_casadi.model.effects.mechanics import reciprocal_coupling
+from psa_casadi.model.shapes import stiffness_scale
 from psa_casadi.model.variables import Input, nominal_value
 
 
@@ -117,7 +117,7 @@ def reciprocal(model: Model) -> Model:
     """Return the model with action and reaction between its two masses, if it has two."""
     if not _is_cascade(model):
         return model
-    return model.with_effect(RECIPROCAL_COUPLING).with_values({"reciprocal_gain": 1.0})
+    return model.with_effect(reciprocal_coupling).with_values({"reciprocal_gain": 1.0})
 
 
 def _is_cascade(model: Model) -> bool:

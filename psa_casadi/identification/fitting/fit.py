@@ -16,6 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -51,7 +53,7 @@ from psa_casadi.identification.fitting.unknowns import (
 )
 from psa_casadi.model.compose import Model
 from psa_casadi.model.variables import nominal_value
-from psa_casadi.records.split import DISPLACEMENT, Channel, Experiment, fitted
+from psa_casadi.records.split import Channel, Experiment, fitted
 from psa_casadi.simulation.simulate import Way
 from psa_casadi.simulation.start import is_stack, resting_states
 from psa_casadi.simulation.stepper import SimulationError
@@ -66,112 +68,6 @@ _LEAST = 1e-6
 _EVALUATIONS, _TOLERANCE = 30, 1e-5
 
 
-def held_out_starts(
-    model: Model,
-    unknowns: Unknowns,
-    theta: FloatArray,
-    experiments: Sequence[Experiment],
-    levels: Sequence[float],
-    way: Way,
-) -> FloatArray:
-    """Return theta with start and offset of the records that are held out whole; others stay.
-
-    `model` has the values of theta; `levels` are the equivalent white-noise standard deviations of
-    the residuals of the channels without factors. Raises PsaError if a record cannot be simulated.
-    """
-    result = theta.copy()
-    outside = {s.name for c in model.components if c.belongs_to != "plant" for s in c.states}
-    for k, experiment in enumerate(experiments):
-        if not experiment.held_out_whole or not experiment.known.any():
-            continue
-        first, last = unknowns.first(k), unknowns.first(k + 1)
-        result[first:last] = 0.0
-        others = _like_starts(unknowns, theta, experiments, k) if unknowns.first_voltage else {}
-        shared = {c: v for c, v in others.items() if unknowns.started[k][c - first] not in outside}
-        result[list(shared)] = [float(np.mean(v)) for v in shared.values()]
-        sizes = {c: float(unknowns.prior[c]) for c in range(first, last) if c not in shared}
-        for c in sizes.keys() & others.keys():
-            size = float(np.sqrt(np.mean(np.square(others[c]))))
-            sizes[c] = min(sizes[c], max(size, _LEAST))
-        result[list(sizes)] = _fit_start(model, unknowns, result, experiment, k, levels, sizes, way)
-    return result
-
-
-def _like_starts(
-    unknowns: Unknowns, theta: FloatArray, experiments: Sequence[Experiment], k: int
-) -> dict[int, list[float]]:
-    """Return the start's coordinates of the fitted records with the first voltage of record k.
-
-    One value for each of these records, by the index of record k's coordinate.
-    """
-    first = unknowns.first(k)
-    size = max(float(np.ptp(e.record.voltage)) for e in experiments)
-    starts = unknowns.first_voltage
-    like = [
-        j
-        for j, other in enumerate(experiments)
-        if not other.held_out_whole and abs(starts[j] - starts[k]) <= _SAME * size
-    ]
-    table = {
-        first + place: [
-            float(theta[unknowns.first(j) + unknowns.started[j].index(name)])
-            for j in like
-            if name in unknowns.started[j]
-        ]
-        for place, name in enumerate(unknowns.started[k])
-    }
-    return {c: values for c, values in table.items() if values}
-
-
-def _fit_start(
-    model: Model,
-    unknowns: Unknowns,
-    theta: FloatArray,
-    experiment: Experiment,
-    k: int,
-    levels: Sequence[float],
-    sizes: Mapping[int, float],
-    way: Way,
-) -> FloatArray:
-    """Return the coordinates of record k with which its first tenth fits best, of such sizes."""
-    columns, prior = list(sizes), 1.0 / np.array(list(sizes.values()))
-    stop = int(np.flatnonzero(experiment.known)[-1]) + 1
-    plain = [j for j, c in enumerate(experiment.channels) if not c.factors]
-    outputs = [experiment.channels[j].outputs[0] for j in plain]
-    at = [experiment.at(j, experiment.known) for j in plain]
-    weights = [levels[i] * experiment.share(j) for i, j in enumerate(plain)]
-
-    def evaluate(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        there = theta.copy()
-        there[columns] = values
-        try:
-            run = trace_record(
-                model, experiment.record, unknowns.start(there, k), (),
-                stop=stop, way=way, outputs=outputs,
-            )  # fmt: skip
-        except PsaError:
-            return None
-        by_start, by_offset = unknowns.place_slopes(there, k)
-        misfit, slopes = [], []
-        for i, (j, known, weight) in enumerate(zip(plain, at, weights, strict=True)):
-            offset, moves = (unknowns.offset(there, k), by_offset) if j == 0 else (0.0, 0.0)
-            predicted = run.y[known[:stop], i] + offset
-            misfit.append((predicted - experiment.measured(j)[known]) / weight)
-            slopes.append(
-                (run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight
-            )
-        return np.concatenate([*misfit, values * prior]), np.vstack([*slopes, np.diag(prior)])
-
-    free = np.full(len(columns), np.inf)
-    minimum = minimise(  # the last coordinate is the offset, exactly linear
-        evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
-        evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
-    )  # fmt: skip
-    if minimum is None:
-        raise PsaError("A held-out record cannot be simulated from where the others begin.")
-    return minimum.theta
-
-
 #: The simulation may err by this share of the noise, or of the range where that is more (rms); 4 %
 #: of the noise shows in the tests of a diagnosis. Where it errs more, steps get finer by tens, and
 #: then the stepper is taken.
@@ -181,24 +77,32 @@ _OF_NOISE, _OF_RANGE, _TENTHS = 0.03, 1e-6, 3
 _DIVERGED = 1e6
 
 
-def accurate_minimum(
+class How(TypedDict, total=False):
+    """How far a minimum is sought (`minimise`), and the tolerance `rtol` of a step."""
+
+    tolerance: float
+    evaluations: int
+    rtol: float
+    goal: float
+    radius: float
+    patient: bool
+
+
+def _accurate_minimum(
     model: Model,
     experiments: Sequence[Experiment],
     unknowns: Unknowns,
     theta: FloatArray,
     sigma: Sequence[float],
     *,
-    tolerance: float,
-    evaluations: int,
+    tolerance: float = 1e-5,
+    evaluations: int = 40,
     rtol: float = FIT_RTOL,
     goal: float = np.inf,
     radius: float = FIRST_RADIUS,
     patient: bool = False,
 ) -> tuple[Minimum, Way, list[Simulated]]:
-    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's.
-
-    See `minimise` for how far it is sought.
-    """
+    """Return the minimum, by a simulation that is accurate there, its `Way`, and each record's."""
     pairs = [(_readings(e, 0), s) for e, s in zip(experiments, sigma, strict=True)]
     allowed = [
         [
@@ -327,7 +231,7 @@ _MOST_ALIKE = 0.98
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """The result of a prediction-error fit.
+    """The result of a prediction-error fit of `experiments`.
 
     `model` carries the estimates; `residuals` (used samples of every record, stacked) [m] are
     measured minus predicted; `jacobian` (samples, size) [m] is d prediction / d theta there;
@@ -335,12 +239,13 @@ class Fit:
     the priors. `converged` is False when the iteration was cut off, `interrupted` True when a
     keyboard interrupt did that. `way` is the tolerance of the simulation, `simulated` holds how
     each record was run and how accurately; it is empty after an interrupt, and above the goal.
-    `radius` is that of the next step. The residuals are those of the first `channel`, `lengths`
-    (records,) of each record and `spread` the range of its readings; `further` are the fits of the
-    other channels. Of any model read displacement as its first channel, m as that one's unit.
+    `radius` is that of the next step. The residuals are those of the first channel; `further` are
+    the fits of the other channels. Of any model read displacement as its first channel, m as that
+    one's unit.
     """
 
     model: Model
+    experiments: tuple[Experiment, ...]
     unknowns: Unknowns
     theta: FloatArray
     residuals: FloatArray
@@ -354,23 +259,22 @@ class Fit:
     simulated: tuple[Simulated, ...]
     radius: float = FIRST_RADIUS
     further: tuple[Further, ...] = ()
-    channel: Channel = DISPLACEMENT
-    lengths: tuple[int, ...] = ()
-    spread: float = 0.0
 
     def __repr__(self) -> str:
         """Return what was fitted and what it leaves, in one line."""
         names = ", ".join(self.unknowns.names)
         return f"<Fit of {names}: residual {self.rms:.3g} m rms, {self.evaluations} evaluations>"
 
-    def of_record(self, experiments: Sequence[Experiment], record: int) -> slice:
-        """Where the used samples of one record stand in `residuals` and `jacobian`."""
-        counts = _counts(experiments[: record + 1])
-        return slice(sum(counts[:-1]), sum(counts))
+    @cached_property
+    def parts(self) -> tuple[slice, ...]:
+        """Where the used samples of every record stand in `residuals` and `jacobian`."""
+        ends = np.cumsum([0, *_counts(self.experiments)]).tolist()
+        return tuple(slice(*pair) for pair in pairwise(ends))
 
-    def residuals_of(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+    @property
+    def record_residuals(self) -> list[FloatArray]:
         """Residuals [m] record by record."""
-        return [self.residuals[self.of_record(experiments, r)] for r in range(len(experiments))]
+        return [self.residuals[part] for part in self.parts]
 
     @property
     def data_cost(self) -> float:
@@ -405,44 +309,40 @@ class Fit:
         """Sensor offset of one record [m]."""
         return self.unknowns.offset(self.theta, record)
 
-    def predicted(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+    def predicted(self) -> list[FloatArray]:
         """Predict whole records [m], held-out samples included."""
-        return [p.displacement for p in self.predictions(experiments, differentiated=False)]
+        return [p.displacement for p in self.predictions(differentiated=False)]
 
     def predictions(
-        self,
-        experiments: Sequence[Experiment],
-        *,
-        differentiated: bool = True,
-        further: bool = False,
+        self, *, differentiated: bool = True, further: bool = False
     ) -> list[Prediction]:
         """Predict whole records with their derivatives by theta, if `differentiated`.
 
         With `further`, the outputs of the further channels as well.
         """
         return predict(
-            self.model, experiments, self.unknowns, self.placed(experiments),
+            self.model, self.experiments, self.unknowns, self.placed(),
             way=self.way, everything=True, differentiated=differentiated, further=further,
         )  # fmt: skip
 
-    def predicted_channels(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+    def predicted_channels(self) -> list[FloatArray]:
         """Predict all channels over whole records (n, channels); nan where a record has none."""
-        parts = self.predictions(experiments, differentiated=False, further=True)
-        further = [predicted_further(experiments, parts, f) for f in self.further]
+        parts = self.predictions(differentiated=False, further=True)
+        further = [predicted_further(self.experiments, parts, f) for f in self.further]
         return [
             np.column_stack(
                 [p.displacement, *(f.get(k, np.full(e.record.n, np.nan)) for f in further)]
             )
-            for k, (e, p) in enumerate(zip(experiments, parts, strict=True))
+            for k, (e, p) in enumerate(zip(self.experiments, parts, strict=True))
         ]
 
-    def outputs(self, experiments: Sequence[Experiment]) -> list[FloatArray]:
+    def outputs(self) -> list[FloatArray]:
         """Predict all outputs of the model over whole records (n, ny), with sensors' offsets."""
-        names, theta = self.model.output_names, self.placed(experiments)
+        names = self.model.output_names
         every = tuple(Channel(n, "", (n,), offset=False, factors=False) for n in names)
-        whole = [replace(e, channels=(*e.channels, *every)) for e in experiments]
+        whole = [replace(e, channels=(*e.channels, *every)) for e in self.experiments]
         parts = predict(
-            self.model, whole, self.unknowns, theta,
+            self.model, whole, self.unknowns, self.placed(),
             way=self.way, everything=True, differentiated=False, further=True,
         )  # fmt: skip
         outputs = [np.column_stack([p.further[n][0] for n in names]) for p in parts]
@@ -452,26 +352,111 @@ class Fit:
                 for y, p in zip(outputs, parts, strict=True):
                     y[:, k] = p.displacement
             elif not channel.channel.factors:
-                for r, y in predicted_further(experiments, parts, channel).items():
+                for r, y in predicted_further(self.experiments, parts, channel).items():
                     outputs[r][:, k] = y
         return outputs
 
-    def placed(self, experiments: Sequence[Experiment]) -> FloatArray:
-        """Return theta with the starts of held-out records (`held_out_starts`)."""
+    def placed(self) -> FloatArray:
+        """Return theta with start and offset of the records that are held out whole.
+
+        Raises PsaError if a record cannot be simulated.
+        """
+        u, result = self.unknowns, self.theta.copy()
+        outside = {
+            s.name for c in self.model.components if c.belongs_to != "plant" for s in c.states
+        }
+        for k, experiment in enumerate(self.experiments):
+            if not experiment.held_out_whole or not experiment.known.any():
+                continue
+            first, last = u.first(k), u.first(k + 1)
+            result[first:last] = 0.0
+            others = self._like_starts(k) if u.first_voltage else {}
+            shared = {c: v for c, v in others.items() if u.started[k][c - first] not in outside}
+            result[list(shared)] = [float(np.mean(v)) for v in shared.values()]
+            sizes = {c: float(u.prior[c]) for c in range(first, last) if c not in shared}
+            for c in sizes.keys() & others.keys():
+                size = float(np.sqrt(np.mean(np.square(others[c]))))
+                sizes[c] = min(sizes[c], max(size, _LEAST))
+            result[list(sizes)] = self._fit_start(result, k, sizes)
+        return result
+
+    def _like_starts(self, k: int) -> dict[int, list[float]]:
+        """Return the start's coordinates of the fitted records with the first voltage of record k.
+
+        One value for each of these records, by the index of record k's coordinate.
+        """
+        u, starts = self.unknowns, self.unknowns.first_voltage
+        size = max(float(np.ptp(e.record.voltage)) for e in self.experiments)
+        like = [
+            j
+            for j, other in enumerate(self.experiments)
+            if not other.held_out_whole and abs(starts[j] - starts[k]) <= _SAME * size
+        ]
+        table = {
+            u.first(k) + place: [
+                float(self.theta[u.first(j) + u.started[j].index(name)])
+                for j in like
+                if name in u.started[j]
+            ]
+            for place, name in enumerate(u.started[k])
+        }
+        return {c: values for c, values in table.items() if values}
+
+    def _fit_start(self, theta: FloatArray, k: int, sizes: Mapping[int, float]) -> FloatArray:
+        """Return the coordinates of record k with which its first tenth fits best, of such sizes.
+
+        Residuals weigh by the equivalent white-noise standard deviations of the channels without
+        factors.
+        """
+        e, u = self.experiments[k], self.unknowns
+        columns, prior = list(sizes), 1.0 / np.array(list(sizes.values()))
+        stop = int(np.flatnonzero(e.known)[-1]) + 1
         plain = [c for c in self.channels if not c.channel.factors]
-        levels = [_equivalent_noise(c.residuals, c.rms) for c in plain]
-        return held_out_starts(self.model, self.unknowns, self.theta, experiments, levels, self.way)
+        outputs = [c.channel.outputs[0] for c in plain]
+        at = [e.at(c.number, e.known) for c in plain]
+        weights = [_equivalent_noise(c.residuals, c.rms) * e.share(c.number) for c in plain]
+
+        def evaluate(values: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+            there = theta.copy()
+            there[columns] = values
+            try:
+                run = trace_record(
+                    self.model, e.record, u.start(there, k), (),
+                    stop=stop, way=self.way, outputs=outputs,
+                )  # fmt: skip
+            except PsaError:
+                return None
+            by_start, by_offset = u.place_slopes(there, k)
+            misfit, slopes = [], []
+            for i, (c, known, weight) in enumerate(zip(plain, at, weights, strict=True)):
+                offset, moves = (0.0, 0.0) if c.number else (u.offset(there, k), by_offset)
+                predicted = run.y[known[:stop], i] + offset
+                misfit.append((predicted - e.measured(c.number)[known]) / weight)
+                slopes.append(
+                    (run.sensitivity[known[:stop], i] @ by_start + moves)[:, columns] / weight
+                )
+            return np.concatenate([*misfit, values * prior]), np.vstack([*slopes, np.diag(prior)])
+
+        free = np.full(len(columns), np.inf)
+        minimum = minimise(  # the last coordinate is the offset, exactly linear
+            evaluate, np.zeros(len(columns)), (-free, free), tolerance=_TOLERANCE,
+            evaluations=_EVALUATIONS, linear=(len(columns) - 1,),
+        )  # fmt: skip
+        if minimum is None:
+            raise PsaError("A held-out record cannot be simulated from where the others begin.")
+        return minimum.theta
 
     @cached_property
     def channels(self) -> tuple[Further, ...]:
         """The fits of all channels, the first one foremost."""
-        records = tuple(k for k, n in enumerate(self.lengths) if n)
-        level = self.sigma[records[0] if records else 0]
+        lengths = _counts(self.experiments)
+        records = tuple(k for k, n in enumerate(lengths) if n)
         first = Further(
-            channel=self.channel, number=0, level=level, spread=self.spread,
+            channel=self.experiments[0].channels[0], number=0,
+            level=self.sigma[records[0] if records else 0], spread=span_of(self.experiments, 0),
             residuals=self.residuals, jacobian=self.jacobian,
             basis=np.zeros((len(self.residuals), 0)), factors=np.ones(1),
-            lengths=tuple(self.lengths[k] for k in records), records=records,
+            lengths=tuple(lengths[k] for k in records), records=records,
         )  # fmt: skip
         return (first, *self.further)
 
@@ -506,12 +491,7 @@ def fit(
     sigma: Sequence[float],
     start: Mapping[str, float] | None = None,
     start_states: Sequence[Mapping[str, float]] | None = None,
-    evaluations: int = 40,
-    tolerance: float = 1e-5,
-    rtol: float = FIT_RTOL,
-    goal: float = np.inf,
-    radius: float = FIRST_RADIUS,
-    patient: bool = False,
+    **how: Unpack[How],
 ) -> Fit:
     """Fit the free parameters, every record's initial state and offset to the used samples.
 
@@ -535,10 +515,15 @@ def fit(
             readings = _readings(e, 0) if e.channels[0].offset else np.zeros(0)
             offset = float(np.mean(readings)) if readings.size else 0.0
             unknowns.place(theta, r, start_states[r] if start_states else {}, offset)
-    minimum, way, runs = accurate_minimum(
-        model, experiments, unknowns, theta, sigma, tolerance=tolerance, evaluations=evaluations,
-        rtol=rtol, goal=goal, radius=radius, patient=patient,
-    )  # fmt: skip
+    return fit_from(model, experiments, unknowns, theta, sigma, **how)
+
+
+def fit_from(
+    model: Model, experiments: Sequence[Experiment], unknowns: Unknowns, theta: FloatArray,
+    sigma: Sequence[float], **how: Unpack[How],
+) -> Fit:  # fmt: skip
+    """Return the fit in the coordinates of `unknowns`, from theta (size,); see `fit`."""
+    minimum, way, runs = _accurate_minimum(model, experiments, unknowns, theta, sigma, **how)
     weights = weights_of(experiments, sigma)
     further: tuple[Further, ...] = ()
     if experiments[0].further:
@@ -547,6 +532,7 @@ def fit(
     fitted_model, further = scaled(model.with_values(unknowns.values(minimum.theta)), further)
     return Fit(
         model=fitted_model,
+        experiments=tuple(experiments),
         unknowns=unknowns,
         theta=minimum.theta,
         residuals=-minimum.residual[: len(weights)] * weights,
@@ -560,9 +546,6 @@ def fit(
         simulated=tuple(runs),
         radius=minimum.radius,
         further=further,
-        channel=experiments[0].channels[0],
-        lengths=tuple(_counts(experiments)),
-        spread=span_of(experiments, 0),
     )
 
 

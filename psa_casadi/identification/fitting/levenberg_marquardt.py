@@ -86,10 +86,8 @@ def minimise(
     cost = float(residual @ residual)
     count, quiet, short, converged, interrupted = 1, 0, 0, False, False
     while count < evaluations and not converged:
-        gradient, normal = jacobian.T @ residual, jacobian.T @ jacobian
-        move = _bounded_step(gradient, normal, radius, low - theta, high - theta)
+        move, predicted = _best_step(theta, residual, jacobian, bounds, radius)
         trial = np.clip(theta + move, low, high)
-        predicted = _decrease(gradient, normal, move)
         if predicted <= 1e-2 * tolerance * cost:
             converged = True
             break
@@ -113,7 +111,9 @@ def minimise(
             short = short + 1 if (evaluations - count) * (cost - new) < new - goal else 0
             theta, (residual, jacobian), cost = trial, at_trial, new
             converged = quiet >= 2 and not (
-                patient and _promised(theta, residual, jacobian, bounds) > _LEFT * tolerance * cost
+                patient
+                and _best_step(theta, residual, jacobian, bounds, np.inf)[1]
+                > _LEFT * tolerance * cost
             )
             if short == 2:
                 break
@@ -121,22 +121,15 @@ def minimise(
     return Minimum(theta, residual, jacobian, cost, converged, interrupted, count, radius)
 
 
-def _promised(
-    theta: FloatArray,
-    residual: FloatArray,
-    jacobian: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-) -> float:
-    """Return by how much a step within the bounds, of any length, promises to lower the cost."""
+def _best_step(
+    theta: FloatArray, residual: FloatArray, jacobian: FloatArray,
+    bounds: tuple[FloatArray, FloatArray], radius: float,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """Return the step within bounds and radius, and by how much it lowers |r + J step|^2."""
     low, high = bounds
     gradient, normal = jacobian.T @ residual, jacobian.T @ jacobian
-    move = _bounded_step(gradient, normal, np.inf, low - theta, high - theta)
-    return _decrease(gradient, normal, move)
-
-
-def _decrease(gradient: FloatArray, normal: FloatArray, move: FloatArray) -> float:
-    """Return by how much a step lowers |r + J step|^2."""
-    return -float(2.0 * gradient @ move + move @ normal @ move)
+    move = _bounded_step(gradient, normal, radius, low - theta, high - theta)
+    return move, -float(2.0 * gradient @ move + move @ normal @ move)
 
 
 def _measurable(

@@ -435,3 +435,9 @@ def _suggestion(stroke: float, span: float) -> str:
         if p
     ]  # fmt: skip
     return f". Perhaps {' and '.join(changes)}" if changes else ""
+
+
+def doubtful(records: Sequence[Record]) -> list[str]:
+    """Say what of records is unlike a stack's: unit, voltage, time, sign, quantity."""
+    every = doubtful_unit, doubtful_voltage, doubtful_time, doubtful_sign, doubtful_quantity
+    return [sentence for doubt in every if (sentence := doubt(records))]

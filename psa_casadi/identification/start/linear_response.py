@@ -204,46 +204,36 @@ class Response:
     sigma: float = 1.0
 
 
-def vector_fit(responses: Sequence[Response], order: int) -> ComplexArray:
-    """Return `order` poles [rad/s] in the left half plane that the responses share."""
-    fastest = 2.0 * min(r.h for r in responses)
-    slowest = max(r.h * r.y.size for r in responses) / 5.0
+def vector_fit(r: Response, order: int) -> ComplexArray:
+    """Return `order` poles [rad/s] of a response in the left half plane."""
+    fastest, slowest = 2.0 * r.h, r.h * r.y.size / 5.0
     spread = (np.arange(order) + 0.5) / order
     poles: ComplexArray = np.array(-1.0 / (fastest * (slowest / fastest) ** spread), dtype=complex)
     for _ in range(_ROUNDS):
-        poles = _settled(_relocated(responses, poles), fastest, slowest)
+        poles = _settled(_relocated(r, poles), fastest, slowest)
     return poles
 
 
-def contributions(responses: Sequence[Response], poles: ComplexArray) -> FloatArray:
-    """Return the largest root mean square of every pole's part of a response, over its noise.
+def contributions(r: Response, poles: ComplexArray) -> FloatArray:
+    """Return the root mean square of every pole's part of a response, over its noise.
 
     Shape (order,); the two poles of a pair share one figure.
     """
-    values = np.zeros(poles.size)
-    for r in responses:
-        columns = _columns(poles, r.w, r.h)
-        matrix = np.column_stack([columns, np.ones(r.y.size)])[r.valid]
-        q, transform = orthonormal(matrix)
-        weights = transform @ (q.T @ r.y[r.valid])
-        for k in np.flatnonzero(poles.imag >= 0):
-            pair = slice(k, k + (2 if poles[k].imag else 1))
-            part = columns[:, pair] @ weights[pair]
-            values[pair] = np.maximum(values[pair], np.std(part) / r.sigma)
+    values, columns = np.zeros(poles.size), _columns(poles, r.w, r.h)
+    q, transform = orthonormal(np.column_stack([columns, np.ones(r.y.size)])[r.valid])
+    weights = transform @ (q.T @ r.y[r.valid])
+    for k in np.flatnonzero(poles.imag >= 0):
+        pair = slice(k, k + (2 if poles[k].imag else 1))
+        values[pair] = np.std(columns[:, pair] @ weights[pair]) / r.sigma
     return values
 
 
-def _relocated(responses: Sequence[Response], poles: ComplexArray) -> ComplexArray:
+def _relocated(r: Response, poles: ComplexArray) -> ComplexArray:
     """Return the zeros of the denominator that the trial poles give."""
-    rows, targets = [], []
-    for index, r in enumerate(responses):
-        one = np.zeros((r.y.size, len(responses)))
-        one[:, index] = 1.0
-        y = -_columns(poles, r.y, r.h)
-        rows.append(np.hstack([_columns(poles, r.w, r.h), one, y])[r.valid] / r.sigma)
-        targets.append(r.y[r.valid] / r.sigma)
-    q, transform = orthonormal(np.vstack(rows))
-    d = (transform @ (q.T @ np.concatenate(targets)))[-poles.size :]
+    one, y = np.ones(r.y.size), -_columns(poles, r.y, r.h)
+    rows = np.column_stack([_columns(poles, r.w, r.h), one, y])[r.valid] / r.sigma
+    q, transform = orthonormal(rows)
+    d = (transform @ (q.T @ (r.y[r.valid] / r.sigma)))[-poles.size :]
     state, drive, sense = np.zeros((poles.size, poles.size)), np.zeros(poles.size), d.copy()
     for k in np.flatnonzero(poles.imag >= 0):
         p, size = poles[k], abs(poles[k])

@@ -33,7 +33,7 @@ from psa_casadi.identification.start.doubts import (
     stray,
 )
 from psa_casadi.model.components import BASE
-from psa_casadi.model.components.stack import BOUC_WEN, MEMORY_SPECTRUM
+from psa_casadi.model.components.stack import bouc_wen, memory_spectrum
 from psa_casadi.model.compose import Model, compose
 from psa_casadi.model.variables import Interval
 from psa_casadi.records.drive import turns
@@ -43,7 +43,7 @@ from psa_casadi.records.record import Record
 #: Forms of the hysteresis by name; `best` is the one that the records prefer.
 Hysteresis = Literal["bouc-wen", "spectrum", "best"]
 
-FORMS = {"bouc-wen": BOUC_WEN, "spectrum": MEMORY_SPECTRUM}
+FORMS = {"bouc-wen": bouc_wen, "spectrum": memory_spectrum}
 
 
 def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:

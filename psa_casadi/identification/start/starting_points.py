@@ -40,12 +40,7 @@ from psa_casadi.identification.start.linear_response import (
     respond,
     vector_fit,
 )
-from psa_casadi.identification.start.ordinary import (
-    has_loop,
-    loop_start,
-    loop_starts,
-    within_base,
-)
+from psa_casadi.identification.start.ordinary import has_loop, loop_start, loop_starts, within_base
 from psa_casadi.model.compose import Model
 from psa_casadi.records.drive import turns
 from psa_casadi.records.noise import high_frequency_noise
@@ -546,7 +541,7 @@ def placed(
 
     Poles that hardly show are left out; with `weak` also those that hardly do over the strongest.
     """
-    response = [Response(e.h, source, e.y, e.valid, e.sigma)]
+    response = Response(e.h, source, e.y, e.valid, e.sigma)
     for order in orders:
         poles = vector_fit(response, order)
         share = contributions(response, poles)

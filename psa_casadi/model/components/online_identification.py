@@ -14,8 +14,8 @@ from itertools import islice
 
 import casadi as ca
 
-from psa_casadi.model.component import Component, Equations, Expression, Symbols
-from psa_casadi.model.scales import hysteresis_scale, voltage_scale
+from psa_casadi.model.component import Equations, Expression, Symbols, component
+from psa_casadi.model.shapes import hysteresis_scale, voltage_scale
 from psa_casadi.model.variables import Input, Output, Parameter, State, Values
 
 #: Parameters that are tracked, in the order of z, and the unit of each.
@@ -357,14 +357,6 @@ def _learnt(
     return now, after, Equations(next=following, out=out), estimated
 
 
-def _online_identification(s: Symbols) -> Equations:
-    c = _constants(s, _PARAMETERS)
-    now, _, learning, theta = _learnt(s, c, s.voltage)
-    predicted = (theta["k_L"] * now.nu + now.phi + theta["offset"]) / c.stiffness
-    more = {"correction": -now.f / theta["k_L"], "prediction_error": s.position - predicted}
-    return replace(learning, out={**learning.out, **more})
-
-
 _PARAMETERS = (
     Parameter("k_L", 10.0, "N/V", (1e-6, 1e6), "start of the linear force per volt", log=True),
     Parameter("A", -2.5, "N/V", (-1e5, 1e5), "start of the slope of the hysteresis force"),
@@ -390,32 +382,38 @@ _PARAMETERS = (
     Parameter("spread", 0.3, "1", (1e-6, 10.0), "how far the starts may be off, as a share"),
 )
 
-_block = partial(Component, belongs_to="drive", sample_period="period")
-ONLINE_IDENTIFICATION = _block(
-    name="online_identification",
+_block = partial(component, belongs_to="drive", sample_period="period")
+
+
+@_block(
+    *_PARAMETERS,
+    _VOLTAGE_IN,
+    _POSITION,
+    *_ESTIMATES,
+    _FORCE,
+    _CORRECTION,
+    Output("prediction_error", "m", "measured minus predicted displacement", stroke, "um"),
     description="recursive least squares of the hysteresis parameters, one sample in, one out",
     source="Yang and Zhu 2015, eq. 38; Ljung and Soderstrom 1983, chapter 3",
     equation_text=(
         "e = K x - (k_L u_lag + f_lag + offset);  z+ = z + P d e/(noise^2 + d'P d);"
         "  P+ = S (P - P d d'P/(noise^2 + d'P d)) S;  d: derivatives of the prediction"
     ),
-    equations=_online_identification,
-    parameters=_PARAMETERS,
     sampled=SAMPLED,
-    inputs=(_VOLTAGE_IN, _POSITION),
-    outputs=(
-        *_ESTIMATES,
-        _FORCE,
-        _CORRECTION,
-        Output("prediction_error", "m", "measured minus predicted displacement", stroke, "um"),
-    ),
 )
+def online_identification(s: Symbols) -> Equations:
+    """Recursive least squares of the hysteresis parameters, one sample in, one out."""
+    c = _constants(s, _PARAMETERS)
+    now, _, learning, theta = _learnt(s, c, s.voltage)
+    predicted = (theta["k_L"] * now.nu + now.phi + theta["offset"]) / c.stiffness
+    more = {"correction": -now.f / theta["k_L"], "prediction_error": s.position - predicted}
+    return replace(learning, out={**learning.out, **more})
 
 
 _LEARNING = ("lag", "memory", "standstill_rate", "noise", "spread")
 _OBSERVING = tuple(
     replace(p, description=p.description.removeprefix("start of the "))
-    for p in ONLINE_IDENTIFICATION.parameters
+    for p in online_identification.parameters
     if p.name not in _LEARNING
 )
 _VOLTAGE = Output("voltage", "V", "voltage at which the stack is where it is wanted", voltage_scale)
@@ -428,17 +426,8 @@ _PAPER = "Yang and Zhu 2015, section 5.1:"
 
 def _constants(s: Symbols, parameters: tuple[Parameter, ...]) -> Constants:
     """Return the constants; what learning needs has its default where a block does not learn."""
-    default: dict[str, Expression] = {p.name: p.value for p in ONLINE_IDENTIFICATION.parameters}
+    default: dict[str, Expression] = {p.name: p.value for p in online_identification.parameters}
     return constants(default | {p.name: getattr(s, p.name) for p in parameters})
-
-
-def _observer(s: Symbols) -> Equations:
-    c = _constants(s, _OBSERVING)
-    force = force_after(c, c.start, s.f_H, s.u_last, s.voltage)
-    return Equations(
-        next={"u_last": s.voltage, "f_H": force},
-        out={"hysteresis_force": s.f_H, "correction": -s.f_H / s.k_L},
-    )
 
 
 def _next_voltage(
@@ -449,7 +438,38 @@ def _next_voltage(
     return linearising_voltage(c, theta, force, last, guess, s.stiffness * s.wanted)
 
 
-def _feed_forward(s: Symbols) -> Equations:
+@_block(
+    *_OBSERVING,
+    _VOLTAGE_IN,
+    _FORCE,
+    _CORRECTION,
+    description="observer of the hysteresis force on the known voltage, one sample in, one out",
+    source=f"{_PAPER} observer (37)",
+    equation_text="f_H+ = f_H by (8) along the line from u- to u",
+    sampled=_LAST,
+)
+def hysteresis_observer(s: Symbols) -> Equations:
+    """Observer of the hysteresis force on the known voltage, one sample in, one out."""
+    c = _constants(s, _OBSERVING)
+    force = force_after(c, c.start, s.f_H, s.u_last, s.voltage)
+    return Equations(
+        next={"u_last": s.voltage, "f_H": force},
+        out={"hysteresis_force": s.f_H, "correction": -s.f_H / s.k_L},
+    )
+
+
+@_block(
+    *_OBSERVING,
+    _WANTED,
+    _VOLTAGE,
+    _FORCE,
+    description="voltage for a wanted displacement of a stack, its hysteresis taken off, sampled",
+    source=f"{_PAPER} observer (37), compensation (39) to (41)",
+    equation_text="k_L u + f_H(u) = K w for u;  f_H(u) by (8) along the line from u-",
+    sampled=(*_LAST, _WANTED_LAST),
+)
+def feed_forward(s: Symbols) -> Equations:
+    """Voltage for a wanted displacement of a stack, its hysteresis taken off, sampled."""
     c = _constants(s, _OBSERVING)
     u = _next_voltage(c, s, list(c.start), s.f_H, s.u_last)
     force = force_after(c, c.start, s.f_H, s.u_last, u)
@@ -459,53 +479,28 @@ def _feed_forward(s: Symbols) -> Equations:
     )
 
 
-def _adaptive(s: Symbols) -> Equations:
+@_block(
+    *online_identification.parameters,
+    _WANTED,
+    _POSITION,
+    _VOLTAGE,
+    *_ESTIMATES,
+    _FORCE,
+    description="feed-forward whose hysteresis parameters follow the measured displacement",
+    source=f"{_PAPER} equations (37) to (41)",
+    equation_text="as feed_forward, with A, beta, gamma, delta, n, k_L of online_identification",
+    sampled=(
+        *SAMPLED,
+        State("applied", "V", "voltage that was returned last", voltage_scale),
+        _WANTED_LAST,
+    ),
+)
+def adaptive_feed_forward(s: Symbols) -> Equations:
     """The voltage that was returned last has been applied when the displacement is measured."""
-    c = _constants(s, ONLINE_IDENTIFICATION.parameters)
+    c = _constants(s, online_identification.parameters)
     _, after, learning, _ = _learnt(s, c, s.applied)
     u = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
     return Equations(
         next={**learning.next, "applied": u, "wanted_last": s.wanted},
         out={"voltage": s.applied, **learning.out},
     )
-
-
-HYSTERESIS_OBSERVER = _block(
-    name="hysteresis_observer",
-    description="observer of the hysteresis force on the known voltage, one sample in, one out",
-    source=f"{_PAPER} observer (37)",
-    equation_text="f_H+ = f_H by (8) along the line from u- to u",
-    equations=_observer,
-    parameters=_OBSERVING,
-    sampled=_LAST,
-    inputs=(_VOLTAGE_IN,),
-    outputs=(_FORCE, _CORRECTION),
-)
-
-FEED_FORWARD = _block(
-    name="feed_forward",
-    description="voltage for a wanted displacement of a stack, its hysteresis taken off, sampled",
-    source=f"{_PAPER} observer (37), compensation (39) to (41)",
-    equation_text="k_L u + f_H(u) = K w for u;  f_H(u) by (8) along the line from u-",
-    equations=_feed_forward,
-    parameters=_OBSERVING,
-    sampled=(*_LAST, _WANTED_LAST),
-    inputs=(_WANTED,),
-    outputs=(_VOLTAGE, _FORCE),
-)
-
-ADAPTIVE_FEED_FORWARD = _block(
-    name="adaptive_feed_forward",
-    description="feed-forward whose hysteresis parameters follow the measured displacement",
-    source=f"{_PAPER} equations (37) to (41)",
-    equation_text="as feed_forward, with A, beta, gamma, delta, n, k_L of online_identification",
-    equations=_adaptive,
-    parameters=ONLINE_IDENTIFICATION.parameters,
-    sampled=(
-        *SAMPLED,
-        State("applied", "V", "voltage that was returned last", voltage_scale),
-        _WANTED_LAST,
-    ),
-    inputs=(_WANTED, _POSITION),
-    outputs=(_VOLTAGE, *_ESTIMATES, _FORCE),
-)

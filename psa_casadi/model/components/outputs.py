@@ -9,8 +9,8 @@ from functools import partial
 
 import casadi as ca
 
-from psa_casadi.model.component import Component, Equations, Expression, Symbols
-from psa_casadi.model.scales import stroke_scale, voltage_scale
+from psa_casadi.model.component import Component, Equations, Expression, Symbols, component
+from psa_casadi.model.shapes import stroke_scale, voltage_scale
 from psa_casadi.model.variables import Output, Parameter, Values
 
 
@@ -22,52 +22,45 @@ def _strained(p: Values) -> float:
     return abs(p["strain_scale"]) * stroke_scale(p) or 1e-3
 
 
-MONITOR = Component(
-    name="monitor",
+@component(
+    Parameter(
+        "monitor_scale", 1.0, "1", (-1e6, 1e6), "monitor per volt at the stack, over the gain"
+    ),
+    Output("monitor_voltage", "V", "voltage that the amplifier's monitor shows", _monitored),
     description="monitor of the voltage that the amplifier puts on the stack",
     source="monitor outputs of piezo amplifiers, a share of the output voltage",
     belongs_to="drive",
-    equations=lambda s: Equations(out={"monitor_voltage": s.monitor_scale * s.u}),
     equation_text="v_mon = monitor_scale u",
-    parameters=(
-        Parameter(
-            "monitor_scale", 1.0, "1", (-1e6, 1e6), "monitor per volt at the stack, over the gain"
-        ),
-    ),
-    outputs=(
-        Output("monitor_voltage", "V", "voltage that the amplifier's monitor shows", _monitored),
-    ),
 )
+def monitor(s: Symbols) -> Equations:
+    """Monitor of the voltage that the amplifier puts on the stack."""
+    return Equations(out={"monitor_voltage": s.monitor_scale * s.u})
 
-SECOND_SENSOR = Component(
-    name="second_sensor",
+
+@component(
+    Parameter("sensor_2_scale", 1.0, "1", (-1e6, 1e6), "second reading over displacement"),
+    Output("displacement_2", "m", "displacement as the second sensor shows it", stroke_scale, "um"),
     description="a second displacement sensor, straight, with a scale of its own",
     source="definition",
     belongs_to="sensor",
-    equations=lambda s: Equations(out={"displacement_2": s.sensor_2_scale * s.displacement}),
     equation_text="x_2 = sensor_2_scale x",
-    parameters=(
-        Parameter("sensor_2_scale", 1.0, "1", (-1e6, 1e6), "second reading over displacement"),
-    ),
-    outputs=(
-        Output(
-            "displacement_2", "m", "displacement as the second sensor shows it", stroke_scale, "um"
-        ),
-    ),
 )
+def second_sensor(s: Symbols) -> Equations:
+    """A second displacement sensor, straight, with a scale of its own."""
+    return Equations(out={"displacement_2": s.sensor_2_scale * s.displacement})
 
-STRAIN_GAUGE = Component(
-    name="strain_gauge",
+
+@component(
+    Parameter("strain_scale", 50.0, "1/m", (-1e9, 1e9), "strain per displacement", scale=50.0),
+    Output("strain", "1", "strain that the gauge shows", _strained),
     description="a strain gauge on the stack, straight, with a scale of its own",
     source="definition",
     belongs_to="sensor",
-    equations=lambda s: Equations(out={"strain": s.strain_scale * s.displacement}),
     equation_text="strain = strain_scale x",
-    parameters=(
-        Parameter("strain_scale", 50.0, "1/m", (-1e9, 1e9), "strain per displacement", scale=50.0),
-    ),
-    outputs=(Output("strain", "1", "strain that the gauge shows", _strained),),
 )
+def strain_gauge(s: Symbols) -> Equations:
+    """A strain gauge on the stack, straight, with a scale of its own."""
+    return Equations(out={"strain": s.strain_scale * s.displacement})
 
 
 #: This much beyond a range, over its size, is still inside: rounding and a sensor's noise.

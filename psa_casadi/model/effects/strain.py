@@ -1,24 +1,34 @@
-"""Effects of the material: how the force per volt changes with field, time, heat and age."""
+"""Effects of the material: creep, hysteresis, and how the force per volt changes with the field."""
 
 import casadi as ca
 
-from psa_casadi.model.component import Component, Equations, Remedy, Symbols
-from psa_casadi.model.shapes import (
-    form,
-    magnitude_power,
-    motion,
-    positive,
-    rate_magnitude,
-    share,
-    smooth_magnitude,
-)
-from psa_casadi.model.variables import Parameter, State, Values
+from psa_casadi.model import shapes
+from psa_casadi.model.component import Equations, Remedy, Symbols, effect
+from psa_casadi.model.shapes import motion, positive, share, smooth_magnitude
+from psa_casadi.model.variables import Parameter, Values
 
 #: Time constants of the relaxations, as multiples of `creep_time`: a decade apart.
 _CREEP_RATIOS = (1.0, 10.0, 100.0)
 
 
-def _slow_creep(s: Symbols) -> Equations:
+@effect(
+    share("creep_gain", (0.0, 0.5), "creep per decade of time over elongation", 0.01),
+    positive("creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep"),
+    *(
+        motion(
+            f"z_c{k}", f"elongation relaxed with time constant {ratio:g} creep_time", memory=True
+        )
+        for k, ratio in enumerate(_CREEP_RATIOS, 1)
+    ),
+    kind="relaxation",
+    description="displacement that keeps growing for seconds to hours at constant voltage",
+    source="Croft, Shed and Devasia, J. Dyn. Sys. Meas. Control 123 (2001) 35: relaxations",
+    equation_text="x_c = creep_gain (z_1 + z_2 + z_3),  creep_time 10^(i-1) z_i' + z_i = x",
+    probe={"creep_time": (0.03, 0.3, 3.0)},
+    remedy=Remedy("wait_or_feed_forward", "hold"),
+    looks_like="the residual is a straight line in log time after every change of voltage",
+)
+def slow_creep(s: Symbols) -> Equations:
     """Slow creep: displacement that keeps growing for seconds to hours at constant voltage."""
     relaxed = [s.z_c1, s.z_c2, s.z_c3]
     return Equations(
@@ -30,35 +40,173 @@ def _slow_creep(s: Symbols) -> Equations:
     )
 
 
-SLOW_CREEP = Component(
-    name="slow_creep",
-    kind="relaxation",
-    description="displacement that keeps growing for seconds to hours at constant voltage",
-    source="Croft, Shed and Devasia, J. Dyn. Sys. Meas. Control 123 (2001) 35: relaxations",
-    gain="creep_gain",
-    equation_text="x_c = creep_gain (z_1 + z_2 + z_3),  creep_time 10^(i-1) z_i' + z_i = x",
-    parameters=(
-        share("creep_gain", (0.0, 0.5), "creep per decade of time over elongation", 0.01),
-        positive("creep_time", 0.1, "s", (1e-3, 1e4), "fastest time constant of the creep"),
+#: Force over voltage of the play elements, over k_L: loops of some 10 % of the stroke.
+_SHARE = 0.3
+#: How steeply the force sets in where the stop element comes to its end.
+_ONSET = 6.0
+
+
+@effect(
+    shapes.share(
+        "rate_gain", (-0.5, 0.5), "growth of the loop's width per decade of voltage rate", 0.05
     ),
-    states=tuple(
-        motion(
-            f"z_c{k}", f"elongation relaxed with time constant {ratio:g} creep_time", memory=True
-        )
-        for k, ratio in enumerate(_CREEP_RATIOS, 1)
+    shapes.positive(
+        "rate_onset",
+        1.0,
+        "1/s",
+        (1e-3, 1e3),
+        "rate over rated voltage, below which the loop no longer changes",
     ),
-    equations=_slow_creep,
-    probe={"creep_time": (0.03, 0.3, 3.0)},
-    remedy=Remedy("wait_or_feed_forward", "hold"),
-    looks_like="the residual is a straight line in log time after every change of voltage",
+    shapes.positive(
+        "rate_threshold", 0.1, "1", (0.01, 1.0), "threshold of the elements over rated voltage"
+    ),
+    shapes.form("rate_by_threshold", "0: the loop grows, 1: thresholds do"),
+    shapes.stop_state("z_r", "stop element of the thresholds that grow"),
+    kind="hysteresis",
+    description="loop width and stroke change with the logarithm of the voltage rate",
+    source=(
+        "Damjanovic, Phys. Rev. B 55 (1997) R649: logarithm of frequency; elements that grow with"
+        " the rate: Ang, Khosla and Riviere, IEEE/ASME Trans. Mechatronics 12 (2007) 134;"
+        " thresholds that do: Al Janaideh, Su and Rakheja, Smart Mater. Struct. 17 (2008) 035026"
+    ),
+    needs=("bouc_wen",),
+    equation_text=(
+        "force gains (c - 1) f_H,  c = (1 + (u'/(rate_onset u_rated))^2)^(rate_gain/(2 ln 10)),  or"
+        " where rate_by_threshold = 1  -(c - 1) 0.3 k_L w |z/w|^6 (sgn(u') + z/w)/2,"
+        "  z' = u' - (|u'| sgn(z) + u')/2 (|z|/w)^4,  w = rate_threshold u_rated"
+    ),
+    probe={"rate_onset": (0.1, 3.0), "rate_by_threshold": (0.0, 1.0)},
+    remedy=Remedy("undo_hysteresis", "slew"),
+    looks_like="loops grow wider, or narrower, by the same share with every decade of rate",
 )
+def rate_dependent_hysteresis(s: Symbols) -> Equations:
+    """Rate-dependent hysteresis: the loop's width changes with the logarithm of the voltage rate.
+
+    Two forms, of which one is tried after the other, with c - 1 = exp(rate_gain L) - 1 and L = lg
+    sqrt(1 + (u'/(rate_onset u_rated))^2), the decades above the onset:
+
+    * the hysteresis force acts c-fold, at every amplitude;
+    * play elements' thresholds w grow c-fold (Al Janaideh): nothing is added after a reversal,
+      and (c - 1) w behind the motion once the element moves, whatever the amplitude.
+
+    A positive gain widens loops and lowers the stroke as the rate rises. The rate acts at once and
+    leaves the memory as it is.
+    """
+    relative = s.voltage_rate / (s.rate_onset * s.u_rated)
+    grown = ca.exp(s.rate_gain * 0.5 * ca.log10(1 + relative**2)) - 1
+    width = s.rate_threshold * s.u_rated
+    at_end = shapes.magnitude_power(s.z_r / width, _ONSET)
+    same_way = 0.5 * (shapes.direction(s) + shapes.signed_power(s.z_r / width, 1.0))
+    behind = -_SHARE * s.k_L * width * at_end * same_way
+    force = s.f_H + s.rate_by_threshold * (behind - s.f_H)
+    return Equations(
+        der={"z_r": shapes.stop_rate(s, s.z_r, width)},
+        add={"free_force": grown * force},
+    )
+
+
+#: Narrowest first threshold, over rated voltage. The memory of a ferroelectric is spread over the
+#: loop; a dwell much narrower than the loop is friction or backlash and not this effect.
+_NARROWEST = 0.0125
+#: Thresholds of the elements over the first one: more than a decade.
+_RATIOS = (1.0, 2.5, 6.0, 15.0)
+#: Cosines over the elements that the weights of plays, of their squares and cubes are made of.
+_COUNTS = (3, 3, 3)
+#: Mean weight at which it is looked for; an ordinary one is larger in narrow elements.
+_ORDINARY = 0.02
+
+_WEIGHTS = tuple(shapes.spectrum_parameters("memory_", _COUNTS, (_ORDINARY, 0.5 * _ORDINARY)))
+
+
+@effect(
+    Parameter(
+        "memory_gain", 0.0, "1", (-100.0, 100.0), "1 with the elements", scale=1.0, fitted=False
+    ),
+    shapes.positive(
+        "memory_threshold", 0.03, "1", (_NARROWEST, 1.0), "first threshold over rated voltage"
+    ),
+    *_WEIGHTS,
+    *shapes.stop_states("z_m", [f"{ratio:g} times the first" for ratio in _RATIOS]),
+    kind="hysteresis",
+    description="a spectrum of further hysteresis elements, symmetric or not",
+    source=(
+        "generalised Prandtl-Ishlinskii: plays, their squares and cubes (Al Janaideh, Rakheja and"
+        " Su, IEEE/ASME Trans. Mechatronics 16 (2011) 734; a Preisach density of second order in"
+        " the mean of its two thresholds), as stops in smooth Bouc-Wen form"
+    ),
+    linear=tuple(p.name for p in _WEIGHTS),
+    equation_text=(
+        "f = k_L memory_gain sum_i z_i (a_i + b_i (2 u - z_i)/u_rated"
+        " + c_i (3 u^2 - 3 u z_i + z_i^2)/u_rated^2),  "
+        "z_i' = u' - (|u'| sgn(z_i) + u')/2 (|z_i|/r_i)^4,  "
+        "r_i = threshold u_rated (1, 2.5, 6, 15),  "
+        "a_i = sum_k play_k cos(pi k (i - 1/2)/4),  b_i and c_i of square_k and cube_k likewise"
+    ),
+    probe={"memory_threshold": (0.015, 0.12)},
+    remedy=Remedy("undo_hysteresis", "reversal"),
+    looks_like=(
+        "the residual changes with the distance from past reversal points; minor loops do not nest"
+    ),
+)
+def hysteresis_memory(s: Symbols) -> Equations:
+    """Hysteresis memory: the error depends on past reversals; minor loops nest differently."""
+    first = s.memory_threshold * s.u_rated
+    elements, rates = shapes.stop_rates(s, "z_m", [ratio * first for ratio in _RATIOS])
+    total = shapes.spectrum_force(s, "memory_", elements, _COUNTS)
+    return Equations(der=rates, add={"free_force": s.k_L * s.memory_gain * total})
+
+
+def _asymmetry_scale(p: Values) -> float:
+    return 0.05 * abs(p["k_L"]) / abs(p["u_rated"])
+
+
+@effect(
+    Parameter(
+        "delta_r",
+        0.0,
+        "N/V2",
+        (-1e5, 1e5),
+        "rate-independent asymmetry",
+        scale=_asymmetry_scale,
+    ),
+    shapes.share("asymmetry_bend", (-100.0, 100.0), "share that follows the hysteresis force", 1.0),
+    kind="hysteresis",
+    description="ascending and descending branch curve differently at every frequency",
+    source=(
+        "the paper's asymmetry (eq. 8, delta) made rate-independent, u sgn(u') -> u |u'|, with the"
+        " even term of generalised Bouc-Wen models (Song and Der Kiureghian, J. Eng. Mech. 2006)"
+    ),
+    needs=("bouc_wen",),
+    equation_text="f_H' gains delta_r |u'| (u + asymmetry_bend u_rated (|f_H|/h_ref)^n)",
+    probe={"asymmetry_bend": (-2.0, 0.0, 2.0)},
+    remedy=Remedy("undo_hysteresis", "reversal"),
+    looks_like=(
+        "the residual differs between rising and falling voltage in the same way at every rate"
+    ),
+)
+def rate_independent_asymmetry(s: Symbols) -> Equations:
+    """Rate-independent asymmetry: the branches curve differently, equally at every frequency."""
+    bend = s.asymmetry_bend * s.u_rated * shapes.magnitude_power(s.f_H / s.h_ref, s.n)
+    return Equations(add={"hysteresis_rate": s.delta_r * (s.u + bend) * shapes.rate_magnitude(s)})
 
 
 #: Width of the smooth magnitude, over rated voltage.
 _REVERSAL_WIDTH = 1e-3
 
 
-def _field_dependent_gain(s: Symbols) -> Equations:
+@effect(
+    share("field_gain", (0.0, 2.0), "growth of the gain at rated voltage", 0.05),
+    kind="curve",
+    description="the displacement per volt grows with the voltage",
+    source=(
+        "Rayleigh's law d = d_0 + alpha E of domain walls: Damjanovic and Demartin, J. Phys. D 29"
+        " (1996) 2057"
+    ),
+    equation_text="f_L gains k_L field_gain u |u| / u_rated",
+    remedy=Remedy("undo_curve", "range"),
+    looks_like="the gain grows in proportion to the amplitude; both branches curve upwards",
+)
+def field_dependent_gain(s: Symbols) -> Equations:
     """Field-dependent gain: the displacement per volt grows with the voltage.
 
     Rayleigh's law is d(E_0) = d_0 + alpha E_0 for an amplitude E_0: strain d_0 E + alpha E_0 E,
@@ -71,24 +219,20 @@ def _field_dependent_gain(s: Symbols) -> Equations:
     return Equations(add={"free_force": s.k_L * s.field_gain * s.u * share})
 
 
-FIELD_DEPENDENT_GAIN = Component(
-    name="field_dependent_gain",
-    kind="curve",
-    description="the displacement per volt grows with the voltage",
+@effect(
+    share("capacitance_gain", (0.0, 3.0), "growth of the capacitance at rated voltage", 0.1),
+    kind="lag",
+    description="the capacitance of the stack grows with the voltage",
     source=(
-        "Rayleigh's law d = d_0 + alpha E of domain walls: Damjanovic and Demartin, J. Phys. D 29"
-        " (1996) 2057"
+        "Rayleigh's law of the permittivity: Hall, J. Mater. Sci. 36 (2001) 4575; large-signal"
+        " capacitance in data sheets of stacks"
     ),
-    gain="field_gain",
-    equation_text="f_L gains k_L field_gain u |u| / u_rated",
-    parameters=(share("field_gain", (0.0, 2.0), "growth of the gain at rated voltage", 0.05),),
-    equations=_field_dependent_gain,
-    remedy=Remedy("undo_curve", "range"),
-    looks_like="the gain grows in proportion to the amplitude; both branches curve upwards",
+    equation_text="C_p u' = i/(1 + capacitance_gain |u|/u_rated)",
+    needs_column=("charge", "current"),
+    remedy=Remedy("control_charge", "slew"),
+    looks_like="charge per volt grows with the amplitude; the drive's lag grows with the voltage",
 )
-
-
-def _field_dependent_capacitance(s: Symbols) -> Equations:
+def field_dependent_capacitance(s: Symbols) -> Equations:
     """Field-dependent capacitance: the stack takes more charge per volt at high voltage.
 
     dq/du = C_p (1 + capacitance_gain |u|/u_rated), Rayleigh's law of the polarisation. The
@@ -105,159 +249,24 @@ def _field_dependent_capacitance(s: Symbols) -> Equations:
     )
 
 
-FIELD_DEPENDENT_CAPACITANCE = Component(
-    name="field_dependent_capacitance",
-    kind="lag",
-    description="the capacitance of the stack grows with the voltage",
-    source=(
-        "Rayleigh's law of the permittivity: Hall, J. Mater. Sci. 36 (2001) 4575; large-signal"
-        " capacitance in data sheets of stacks"
+@effect(
+    share(
+        "saturation_gain",
+        (0.0, 10.0),
+        "twice the share of force that is lost at rated voltage, while that is small",
+        0.05,
     ),
-    gain="capacitance_gain",
-    equation_text="C_p u' = i/(1 + capacitance_gain |u|/u_rated)",
-    parameters=(
-        share("capacitance_gain", (0.0, 3.0), "growth of the capacitance at rated voltage", 0.1),
-    ),
-    equations=_field_dependent_capacitance,
-    needs_column=("charge", "current"),
-    remedy=Remedy("control_charge", "slew"),
-    looks_like="charge per volt grows with the amplitude; the drive's lag grows with the voltage",
-)
-
-
-def _saturation_of_strain(s: Symbols) -> Equations:
-    """Saturation of strain: the curve flattens at high voltage, on both branches."""
-    share = 1 / ca.sqrt(1 + s.saturation_gain * (s.u / s.u_rated) ** 2) - 1
-    return Equations(add={"free_force": s.k_L * s.u * share})
-
-
-SATURATION_OF_STRAIN = Component(
-    name="saturation_of_strain",
     kind="curve",
     description="the strain saturates as the domains that can still turn run out",
     source=(
         "saturating anhysteretic polarisation: Smith, Smart Material Systems, SIAM 2005, chapter 2;"
         " here u / sqrt(1 + g u^2) for its Langevin or tanh law"
     ),
-    gain="saturation_gain",
     equation_text="f_L = k_L u / sqrt(1 + saturation_gain (u/u_rated)^2)",
-    parameters=(
-        share(
-            "saturation_gain",
-            (0.0, 10.0),
-            "twice the share of force that is lost at rated voltage, while that is small",
-            0.05,
-        ),
-    ),
-    equations=_saturation_of_strain,
     remedy=Remedy("undo_curve", "range"),
     looks_like="the curve flattens towards high voltage on both branches, at every rate",
 )
-
-
-def _self_heating(s: Symbols) -> Equations:
-    """Self-heating: losses warm the stack under fast drive, and its gain changes with the warmth.
-
-    The loss is what the hysteresis dissipates: f_H u' less the rate of the energy f_H^2/(2 A) that
-    it stores leaves beta |u'| |f_H| r^n / A, which grows with the third power of a small swing and
-    more slowly with a large one. Share of heat, heat capacity and the gain's temperature
-    coefficient act as one number, heating_gain.
-    """
-    loss = rate_magnitude(s) / s.u_rated * magnitude_power(s.f_H / s.h_ref, s.n + 1)
-    return Equations(
-        der={"heat": loss - s.heat / s.heating_time},
-        add={"free_force": s.heating_gain * s.heat * (s.k_L * s.u + s.f_H)},
-    )
-
-
-def _heat(p: Values) -> float:
-    """Heat [1] under one cycle 0 .. u_rated .. 0 a second, at equilibrium."""
-    straight = abs(p["A"]) * p["u_rated"] / (2.0 * p["h_ref"])
-    bent = (abs(p["A"]) / max(p["beta"] + p["gamma"], 1e-9 * abs(p["A"]), 1e-300)) ** (1.0 / p["n"])
-    largest = max(min(straight, bent), 1e-3)
-    return float(largest ** (p["n"] + 1.0)) * p["heating_time"]
-
-
-def _heating_scale(p: Values) -> float:
-    """A gain that changes by 1 % under one full cycle a second."""
-    return 0.01 / _heat(p)
-
-
-SELF_HEATING = Component(
-    name="self_heating",
-    kind="changing gain",
-    description="the gain changes as losses warm the stack, and recovers when it rests",
-    source=(
-        "Zheng, Takahashi, Yoshikawa, Uchino and de Vries, J. Am. Ceram. Soc. 79 (1996) 3193: heat"
-        " generation in multilayer actuators in proportion to the loss of the hysteresis"
-    ),
-    gain="heating_gain",
-    needs=("bouc_wen",),
-    equation_text=(
-        "force gains heating_gain q (f_L + f_H),"
-        "  q' = |u'|/u_rated (|f_H|/h_ref)^(n+1) - q / heating_time"
-    ),
-    parameters=(
-        share(
-            "heating_gain",
-            (0.0, 1e3),
-            "growth of the gain per loss of one rated swing at h_ref still felt",
-            _heating_scale,
-        ),
-        Parameter("heating_time", 3.0, "s", (1e-2, 1e5), "time constant of cooling", log=True),
-    ),
-    states=(
-        State("heat", "1", "loss not cooled off, in rated swings at h_ref", _heat, memory=True),
-    ),
-    equations=_self_heating,
-    probe={"heating_time": (1.0, 10.0)},
-    remedy=Remedy("cool", "record"),
-    looks_like="the gain climbs while the drive is fast and recovers when it rests",
-)
-
-
-#: Width of the smooth start of ageing at time 0, over ageing_time.
-_BEGIN_WIDTH = 1e-9
-
-
-def _ageing(s: Symbols) -> Equations:
-    """Ageing: the gain falls with the logarithm of time, or of the cycles that the stack has made.
-
-    Time counts from the zero of the record's clock; before it nothing ages. What went on earlier,
-    since the poling of the ceramic, is part of k_L. Where cycles age it, one at rated voltage
-    counts as one second does; which of the two it is, is not fitted but tried.
-    """
-    age = s.time + s.ageing_by_travel * (s.travel - s.time)
-    ages = age / s.ageing_time
-    since = 0.5 * (ages + ca.sqrt(ages**2 + _BEGIN_WIDTH**2))
-    lost = s.ageing_gain * ca.log10(1 + since)
-    travel = 0.5 * rate_magnitude(s) / s.u_rated
-    return Equations(der={"travel": travel}, add={"free_force": -lost * s.k_L * s.u})
-
-
-AGEING = Component(
-    name="ageing",
-    kind="changing gain",
-    description="the gain falls with the logarithm of time or of the cycles made",
-    source=(
-        "Jaffe, Cook and Jaffe, Piezoelectric Ceramics, 1971: ageing per decade of time; Hall and"
-        " Ben-Omran, J. Phys.: Condens. Matter 10 (1998) 9129: of cycles"
-    ),
-    gain="ageing_gain",
-    equation_text=(
-        "f_L gains -ageing_gain lg(1 + a/ageing_time) k_L u,  a = t from the zero of the record's"
-        " clock, or N where ageing_by_travel = 1,  N' = |u'|/(2 u_rated), 1 s for each cycle"
-    ),
-    parameters=(
-        share("ageing_gain", (0.0, 0.3), "share of the gain lost per decade", 0.01),
-        positive("ageing_time", 1.0, "s", (1e-3, 1e7), "age at time 0 of the record's clock"),
-        form("ageing_by_travel", "0: time ages, 1: cycles do"),
-    ),
-    states=(
-        State("travel", "s", "cycles at rated voltage, 1 s each", 1.0, memory=True, settles=False),
-    ),
-    equations=_ageing,
-    probe={"ageing_time": (0.1, 10.0), "ageing_by_travel": (0.0, 1.0)},
-    remedy=Remedy("identify_again", "record"),
-    looks_like="the gain falls by the same share with every decade of time, or of cycles made",
-)
+def saturation_of_strain(s: Symbols) -> Equations:
+    """Saturation of strain: the curve flattens at high voltage, on both branches."""
+    share = 1 / ca.sqrt(1 + s.saturation_gain * (s.u / s.u_rated) ** 2) - 1
+    return Equations(add={"free_force": s.k_L * s.u * share})

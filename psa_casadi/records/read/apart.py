@@ -20,9 +20,10 @@ import numpy as np
 from psa_casadi.common.children import end_with_parent, heard, started_python
 from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.common.files import temporary_folder
+from psa_casadi.records.read.choose import Request
 from psa_casadi.records.read.columns import MARKS, WORDS, Field, stated_unit
 from psa_casadi.records.read.formats import READERS, ending_of
-from psa_casadi.records.read.samples import Head, Outcome, Request, samples_of
+from psa_casadi.records.read.samples import Head, Outcome, samples_of
 from psa_casadi.records.read.table import Table, check_there, parts_of_file, read_text
 from psa_casadi.records.read.text import decoded, text_tables
 

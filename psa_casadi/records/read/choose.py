@@ -4,7 +4,7 @@ import difflib
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -109,28 +109,98 @@ class Question(NamedTuple):
     cure: str = ""
 
 
-class Choice:
-    """The columns that the header of a table names for sure: `fields`.
+@dataclass(frozen=True)
+class Request:
+    """What is wanted of a file.
 
-    `open` is what it leaves open, `sources` what is suggested for that. `wanted` maps columns of
-    the record to names in the header, or to numbers counted from 1. Added to `problems`: columns
-    misspelled or there twice, units that are wrong, names in `wanted` that the table does not have.
+    `columns` maps columns to their sources, `sample_time` [s] is the time between samples without
+    one, `table` takes one of several tables; `needed` are the columns that must be there besides
+    the time, and `excitation` demands a voltage that changes. With `names`, those of a model's
+    inputs and outputs, it is a record on that model; else one of a stack, or without a voltage
+    among the needed a path to follow, which is checked elsewhere.
     """
 
-    def __init__(
-        self, table: Table, required: Sequence[str], wanted: ColumnMap, problems: Problems
-    ) -> None:
-        self.table, self.required, self.wanted = table, required, wanted
-        self.problems, self.fields = problems, dict[str, Field]()
-        self.left, self.open, self.sources = list[Cell](), list[Question](), dict[str, Source]()
+    columns: ColumnMap = field(default_factory=dict)
+    sample_time: float | None = None
+    table: str = ""
+    needed: tuple[str, ...] = ("voltage", "displacement")
+    excitation: bool = False
+    names: tuple[str, ...] = ()
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """The columns that must be there."""
+        return (*(("time",) if self.sample_time is None else ()), *self.needed)
+
+    @property
+    def whole(self) -> tuple[str, ...]:
+        """The columns that may lack no sample."""
+        return ("time", *(self.needed if self.names else ("voltage",)))
+
+    def chosen(self, table: Table, problems: Problems) -> "Chosen":
+        """Return which column of a table is which."""
+        if self.names:
+            return ByName(table, self, problems)
+        return Choice(with_usual_units(table), self, problems)
+
+
+class Chosen:
+    """The columns of a table by name: `fields`.
+
+    `open` is what the table leaves open, `sources` what is suggested for that, `unread` are the
+    labels of other columns where one that is wanted is missing. Added to `problems`: columns that
+    are there twice, units that are wrong, names in `request.columns` that the table does not have.
+    """
+
+    def __init__(self, table: Table, request: Request, problems: Problems) -> None:
+        self.table, self.request, self.problems = table, request, problems
+        self.wanted, self.fields = request.columns, dict[str, Field]()
+        self.open, self.sources = list[Question](), dict[str, Source]()
         self.unread: tuple[str, ...] = ()
-        if table.headless and not wanted:
+
+    def _refuse_absent(self, name: str, source: Source, present: str) -> None:
+        self.problems.add(
+            f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
+            f" not in the header (found: {present}); correct --columns."
+        )
+
+    def _refuse_second(self, name: str, index: int, first: Field) -> None:
+        self.problems.add(
+            f"{self.table.where}, column {index + 1}: '{name}' stands twice in the header (first"
+            f" as column {first.index + 1}); rename or remove one of the two."
+        )
+
+    def _refuse_other_unit(self, where: str, stated: str | None, wanted: str | None) -> None:
+        self.problems.add(
+            f"{where}: the header gives the unit '{stated}', --columns gives '{wanted}'; leave the"
+            f" one in --columns out, or say there what 1 in the file is, such as 10{wanted}."
+        )
+
+    def _ask_header(self, example: str) -> None:
+        text = f"{self.table.where}: found '{self.table.headless[:60]}', expected a header"
+        self.open = [Question(text, ASK_UNIT, f"write a first line such as '{example}'")]
+
+    def _ask_column(self, name: str, present: str, cure: str) -> None:
+        what = f"{self.table.where}: the column '{name}' is missing (found: {present})"
+        self.open.append(Question(what, ASK_COLUMN, "" if self.table.sizes else cure))
+
+
+class Choice(Chosen):
+    """The columns of a record on a stack that the header of a table names for sure.
+
+    Columns that are misspelled are mistakes. `left` are the other cells.
+    """
+
+    def __init__(self, table: Table, request: Request, problems: Problems) -> None:
+        super().__init__(table, request, problems)
+        self.required, self.left = request.required, list[Cell]()
+        if table.headless and not self.wanted:
             self._count()
             return
         self._take_canonical_names()
         unclear = self._take_other_names()
         self._ask(unclear, self._complain())
-        self.sources = {**wanted, **self.sources} if self.sources else {}
+        self.sources = {**self.wanted, **self.sources} if self.sources else {}
 
     def _count(self) -> None:
         """Suggest columns of a table without a header by their numbers."""
@@ -140,9 +210,7 @@ class Choice:
         rest = iter(k for k in free if k != time)
         places = {name: time if name == "time" else next(rest, None) for name in required}
         self.sources = {n: usual_source(n, str(k + 1)) for n, k in places.items() if k is not None}
-        example = ",".join(COLUMNS[name].example for name in required)
-        text = f"{table.where}: found '{table.headless[:60]}', expected a header"
-        self.open.append(Question(text, ASK_UNIT, f"write a first line such as '{example}'"))
+        self._ask_header(",".join(COLUMNS[name].example for name in required))
 
     def _take_canonical_names(self) -> None:
         """Take the cells with the columns' canonical names and units, and those of `--columns`."""
@@ -158,10 +226,7 @@ class Choice:
             if name not in COLUMNS or (not requested and (open_unit or second or name in wanted)):
                 self.left.append(_cell_of(last(text), table.labels[index], index))
             elif name in self.fields:
-                self.problems.add(
-                    f"{table.where}, column {index + 1}: '{name}' stands twice in the header (first"
-                    f" as column {self.fields[name].index + 1}); rename or remove one of the two."
-                )
+                self._refuse_second(name, index, self.fields[name])
             else:
                 place = f"column '{bare if requested else name}'"
                 unit = unit or (unit_for(name, last_name(bare)) if requested else None)
@@ -205,10 +270,7 @@ class Choice:
         """Complain of columns misspelled or not there; return the others that are missing."""
         for name, source in self.wanted.items():
             if place_of(source.array, self.table) is None:
-                self.problems.add(
-                    f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
-                    f" not in the header (found: {self._listed(self.fields)}); correct --columns."
-                )
+                self._refuse_absent(name, source, self._listed(self.fields))
         absent = [name for name in COLUMNS if name not in self.fields]
         near = {c.misspelled(absent): c for c in self.left if c.column is None}
         near.pop("", None)
@@ -233,11 +295,10 @@ class Choice:
             cure = f"write {examples} in the header" if in_header else ""
             questions.append(Question(f"{where}: {which}", ASK_UNIT, cure))
         listed = self._listed([name for name in self.fields if name not in unclear])
+        scales, self.open = self.open, questions
         for name in missing:
-            cure = f"add it to the header as '{COLUMNS[name].example}'" if in_header else ""
-            what = f"{where}: the column '{name}' is missing (found: {listed})"
-            questions.append(Question(what, ASK_COLUMN, cure))
-        self.open = [*questions, *self.open]
+            self._ask_column(name, listed, f"add it to the header as '{COLUMNS[name].example}'")
+        self.open += scales
         chosen = self._suggested([*unclear, *missing])
         self.sources |= {n: usual_source(n, c.label, c.hint) for n, c in chosen.items()}
         length = chosen.get("displacement")
@@ -289,11 +350,7 @@ class Choice:
             units = {replace(parse_unit(u), name="", quantity="") for u in (text, inputs) if u}
             if len(units) < 2:
                 return unit or ""
-            self.problems.add(
-                f"{where}: the header gives the unit '{text}', --columns gives '{inputs}'; leave"
-                " the one in --columns out, or say there what 1 in the file is, such as"
-                f" 10{inputs}."
-            )
+            self._refuse_other_unit(where, text, inputs)
         return unit or ""
 
     def _is_one_clock(self, cells: Sequence[Cell]) -> bool:
@@ -394,26 +451,16 @@ def last_name(label: str) -> str:
     return re.sub(r"(?<=\w\w)\.\d+(?=$| \[)", "", name)
 
 
-class ByName:
-    """The columns of a table that are the time and the inputs and outputs of a model: `fields`.
+class ByName(Chosen):
+    """The columns of a table that are the time and the inputs and outputs of a model.
 
     Names are compared without case, spaces, underscores and the unit behind them; none is guessed
-    from its unit. `names` are the model's, `required` what must be there.
-    The unit of a field is "" where the table states none, but that of the time "s". `unread` are
-    the labels of other columns where a name is missing. `open`,
-    `sources`, `wanted` and `problems` are those of `Choice`.
+    from its unit. The unit of a field is "" where the table states none, but that of the time "s".
     """
 
-    def __init__(
-        self,
-        table: Table,
-        names: Sequence[str],
-        required: Sequence[str],
-        wanted: ColumnMap,
-        problems: Problems,
-    ) -> None:
-        self.table, self.names, self.problems = table, ("time", *names), problems
-        self.open, self.sources = list[Question](), dict[str, Source]()
+    def __init__(self, table: Table, request: Request, problems: Problems) -> None:
+        super().__init__(table, request, problems)
+        self.names, wanted = ("time", *request.names), self.wanted
         fields: dict[str, Field] = {}
         self._take_wanted(fields, wanted)
         self._take_named(fields)
@@ -423,12 +470,10 @@ class ByName:
         self.unread = self._others(fields) if len(fields) < len(self.names) else ()
         if time := fields.get("time"):
             check_unit(COLUMNS["time"], time.unit, f"{table.where}, column 'time'", problems)
-        for name in [n for n in required if n not in fields and n not in wanted]:
+        for name in [n for n in request.required if n not in fields and n not in wanted]:
             self._ask(name)
         if self.open and table.headless:
-            example = ",".join(self.names)
-            text = f"{table.where}: found '{table.headless[:60]}', expected a header"
-            self.open = [Question(text, ASK_UNIT, f"write a first line such as '{example}'")]
+            self._ask_header(",".join(self.names))
         self.sources = {**wanted, **self.sources} if self.sources else {}
 
     def _take_wanted(self, fields: dict[str, Field], wanted: ColumnMap) -> None:
@@ -436,18 +481,12 @@ class ByName:
         for name, source in wanted.items():
             index = place_of(source.array, self.table)
             if index is None:
-                self.problems.add(
-                    f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
-                    f" not in the header (found: {self._listed(fields)}); correct --columns."
-                )
+                self._refuse_absent(name, source, self._listed(fields))
                 continue
             stated = stated_unit(self._text(index))
             if stated and source.unit and source.scale is None and stated != source.unit:
-                self.problems.add(
-                    f"{self.table.where}, column '{source.array}': the header gives the unit"
-                    f" '{stated}', --columns gives '{source.unit}'; leave the one in --columns out,"
-                    f" or say there what 1 in the file is, such as 10{source.unit}."
-                )
+                where = f"{self.table.where}, column '{source.array}'"
+                self._refuse_other_unit(where, stated, source.unit)
             fields[name] = Field(index, source.unit or stated or self._usual(name))
 
     def _take_named(self, fields: dict[str, Field]) -> None:
@@ -466,10 +505,7 @@ class ByName:
             if name in fields and (name in requested or ranks[name] != rank):
                 continue
             if name in fields and index not in taken:
-                self.problems.add(
-                    f"{self.table.where}, column {index + 1}: '{name}' stands twice in the header"
-                    f" (first as column {fields[name].index + 1}); rename or remove one of the two."
-                )
+                self._refuse_second(name, index, fields[name])
             elif index not in taken:
                 fields[name], ranks[name] = Field(index, unit or self._usual(name)), rank
                 taken.add(index)
@@ -494,9 +530,8 @@ class ByName:
         if near:
             unit = stated_unit(self._text(near[0])) or self._usual(name)
             self.sources[name] = Source(labels[near[0]], unit or None)
-        what = f"{self.table.where}: the column '{name}' is missing (found: {self._listed({})})"
         cure = f"add it to the header as '{name}', with its unit behind it in brackets"
-        self.open.append(Question(what, ASK_COLUMN, "" if self.table.sizes else cure))
+        self._ask_column(name, self._listed({}), cure)
 
     def _cells(self) -> list[int]:
         """Return the columns that may be one of samples."""

@@ -99,8 +99,8 @@ def check_unit(column: Column, unit: str | None, where: str, problems: Problems)
     accepted = ", ".join(name for q in column.quantities for name in units_of(q))
     if unit is None or not unit.strip():
         problems.add(
-            f"{where}: has no unit; write it in brackets, such as '{column.example}' (units: "
-            f"{accepted})."
+            f"{where}: has no unit; write it in brackets, such as '{column.example}', or behind the"
+            f" name in --columns, {column.name}=NAME:UNIT (units: {accepted})."
         )
         return
     try:

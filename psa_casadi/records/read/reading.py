@@ -26,7 +26,7 @@ from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.common.files import atomic_write
 from psa_casadi.common.units import FloatArray, parse_unit, to_si
 from psa_casadi.records.read import apart
-from psa_casadi.records.read.choose import is_rising
+from psa_casadi.records.read.choose import Request, is_rising
 from psa_casadi.records.read.columns import (
     ALL,
     TABLE,
@@ -38,7 +38,7 @@ from psa_casadi.records.read.columns import (
     stated_unit,
 )
 from psa_casadi.records.read.formats import Series, array_tables
-from psa_casadi.records.read.samples import Outcome, Request, samples_of
+from psa_casadi.records.read.samples import Outcome, samples_of
 from psa_casadi.records.read.table import Cells, Columns, Table, as_numbers, is_stamp, seconds_of
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 from psa_casadi.records.signals import Hold, Signals

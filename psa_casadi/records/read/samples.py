@@ -7,7 +7,7 @@ import numpy as np
 
 from psa_casadi.common.errors import InputError, Problems, quoted
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
-from psa_casadi.records.read.choose import ASK_UNIT, ByName, Choice, Question, with_usual_units
+from psa_casadi.records.read.choose import ASK_UNIT, Chosen, Question, Request
 from psa_casadi.records.read.columns import ALL, ColumnMap, Field, ready_line
 from psa_casadi.records.read.table import (
     Cells,
@@ -23,58 +23,13 @@ from psa_casadi.records.read.table import (
     starts_of,
     without_overload,
 )
-from psa_casadi.records.record import (
-    FEWEST_SAMPLES,
-    Check,
-    Located,
-    check_complete,
-    check_displacement,
-    check_excitation,
-    check_finite,
-    check_length,
-    check_time,
-)
+from psa_casadi.records.record import FEWEST_SAMPLES, Located
 
 #: A sample time [s] to show where a file has no time.
 _EXAMPLE_STEP = 1e-3
 
 #: The most tables and segments that are named in one sentence.
 MOST_NAMED = 8
-
-
-@dataclass(frozen=True)
-class Request:
-    """What is wanted of a file.
-
-    `columns` maps columns to their sources, `sample_time` [s] is the time between samples without
-    one, `table` takes one of several tables; `needed` are the columns that must be there besides
-    the time, and `excitation` demands a voltage that changes. With `names`, those of a model's
-    inputs and outputs, it is a record on that model; else one of a stack, or without a voltage
-    among the needed a path to follow, which is checked elsewhere.
-    """
-
-    columns: ColumnMap = field(default_factory=dict)
-    sample_time: float | None = None
-    table: str = ""
-    needed: tuple[str, ...] = ("voltage", "displacement")
-    excitation: bool = False
-    names: tuple[str, ...] = ()
-
-    @property
-    def required(self) -> tuple[str, ...]:
-        """The columns that must be there."""
-        return (*(("time",) if self.sample_time is None else ()), *self.needed)
-
-    @property
-    def whole(self) -> tuple[str, ...]:
-        """The columns that may lack no sample."""
-        return ("time", *(self.needed if self.names else ("voltage",)))
-
-    def chosen(self, table: Table, problems: Problems) -> Choice | ByName:
-        """Return which column of a table is which."""
-        if self.names:
-            return ByName(table, self.names, self.required, self.columns, problems)
-        return Choice(with_usual_units(table), self.required, self.columns, problems)
 
 
 @dataclass(frozen=True)
@@ -189,7 +144,7 @@ def _of_one(table: Table, request: Request, segment: str) -> Outcome:
 
 
 def _offer(
-    table: Table, request: Request, choice: Choice | ByName, segment: str
+    table: Table, request: Request, choice: Chosen, segment: str
 ) -> tuple[tuple[ColumnMap, float | None] | None, str]:
     """Return the first options with which the table is read, and the part of it that they take."""
     inputs = request.sample_time
@@ -279,7 +234,8 @@ class _Try:
         wrong: BoolArray | None = None,
     ) -> Located:  # fmt: skip
         reported = np.zeros(values.size, dtype=np.bool_) if wrong is None else wrong
-        return Located(self.table.path, name, values, lines, reported, self.table.place)
+        table = self.table
+        return Located(table.path, name, values, lines, reported, table.place, self.problems)
 
     def _numbers(
         self, name: str, unit: str, cells: Cells, lines: IndexArray, point: str
@@ -386,10 +342,19 @@ class _Try:
                 self.notes.append(f"{count} readings of {column} are missing; they are masked.")
         if not self.request.names and "voltage" not in self.request.needed:
             return
-        check_length(self.table.path, len(next(iter(locateds.values())).lines), self.problems)
-        checks: dict[str, Check] = {"time": check_time, "displacement": check_displacement}
-        checks |= dict.fromkeys(outputs, check_finite)
+        samples = len(next(iter(locateds.values())).lines)
+        if samples < FEWEST_SAMPLES:
+            more = "record for longer" if samples else "fill the rows below its header"
+            self.problems.add(
+                f"{self.table.path}: found {samples} samples, expected at least {FEWEST_SAMPLES};"
+                f" {more}, or name the right file."
+            )
         for name, located in locateds.items():
-            checks.get(name, check_complete)(located, self.problems)
+            if name == "time":
+                located.check_time()
+            elif name == "displacement" and name not in outputs:
+                located.check_displacement()
+            else:
+                located.check_finite(complete=name not in outputs)
             if name == "voltage" and self.request.excitation and not located.reported.any():
-                check_excitation(located, self.problems)
+                located.check_excitation()

@@ -11,7 +11,6 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.design.experiment.experiment import Informative, Separated
 from psa_casadi.design.mechanism.loop import Mounting, response_times, step_response
 from psa_casadi.design.mechanism.mechanism import MechanismDesign, mounted_model, root_locus
-from psa_casadi.design.tracking.inversion import CorrectedInput, InvertedInput
 from psa_casadi.design.tracking.minimum_time import QuickMove
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, Target, respond
 from psa_casadi.design.tracking.tracking import TrackedInput
@@ -22,6 +21,7 @@ from psa_casadi.report.page.live import LiveModel, live_design
 from psa_casadi.report.plots.figures import record_figure, response_figure
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours, design_words
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import any_scale, in_brackets, number, plain
 
 _COLOURS = (colours.EXTENDED, colours.BASE, colours.MEASURED)
@@ -74,34 +74,16 @@ def tracking_pictures(tracked_input: TrackedInput, uncompensated: FloatArray) ->
     """Return path and response, the error, and the voltage with its limits."""
     target, x = tracked_input.target, tracked_input.response.displacement
     share = 100.0 / target.span
-    paths = _path_and("designed, simulated", target, x)
-    _curve(paths, target.time, 1e6 * uncompensated, "uncompensated, simulated", colours.BASE)
+    responses = ("designed, simulated", x), ("uncompensated, simulated", uncompensated)
     errors = Panel("time [ms]", "error [% of range]", _HEIGHT)
     _curve(errors, target.time, share * (x - target.displacement), "simulated")
     if tracked_input.by_program:
         predicted = share * (tracked_input.predicted - target.displacement)
         _curve(errors, target.time, predicted, "predicted by the program", colours.BASE, 1.2)
     return [
-        Picture("Path and response", paths),
+        path_picture("Path and response", target, *responses),
         Picture("Error of the designed input", errors),
-        _voltage(tracked_input.response, tracked_input.limits),
-    ]
-
-
-def inversion_pictures(inverted_input: InvertedInput, limits: AmplifierLimits) -> list[Picture]:
-    """Return path and response of an inverted input, and the voltage with its limits."""
-    plot = _path_and(
-        "inverted, simulated", inverted_input.target, inverted_input.response.displacement
-    )
-    return [Picture("Path and response", plot), _voltage(inverted_input.response, limits)]
-
-
-def trial_pictures(corrected_input: CorrectedInput) -> list[Picture]:
-    """Return path and measured trial, and the voltages played and corrected."""
-    plot = _path_and("trial, measured", corrected_input.target, corrected_input.measured)
-    return [
-        Picture("Path and trial", plot),
-        _voltage(corrected_input.response, corrected_input.limits, corrected_input.played),
+        voltage_picture(tracked_input.response, tracked_input.limits),
     ]
 
 
@@ -111,20 +93,22 @@ def move_pictures(quick_move: QuickMove) -> list[Picture]:
     r = quick_move.response
     _curve(plot, r.time, 1e6 * r.displacement, "simulated", width=1.8)
     note = "Dashed: the position to reach. The voltage holds its last value behind the move."
-    pictures = [Picture("Move and hold", plot, note), _voltage(r, quick_move.limits)]
+    pictures = [Picture("Move and hold", plot, note), voltage_picture(r, quick_move.limits)]
     for picture in pictures:
         picture.panel.axes({"range": [0.0, _SHOWN * 1e3 * quick_move.move_time]})
     return pictures
 
 
-def _path_and(name: str, target: Target, displacement: FloatArray) -> Panel:
-    """Return the path over time, and a displacement [m] on it."""
+def path_picture(caption: str, target: Target, *curves: tuple[str, FloatArray]) -> Picture:
+    """Return the path over time, and displacements (n,) [m] on it by their names."""
     plot = Panel("time [ms]", "displacement [µm]", _HEIGHT)
     _curve(plot, target.time, 1e6 * target.displacement, "path", colours.MEASURED, 3.0)
-    return _curve(plot, target.time, 1e6 * displacement, name)
+    for (name, displacement), colour in zip(curves, _COLOURS, strict=False):
+        _curve(plot, target.time, 1e6 * displacement, name, colour)
+    return Picture(caption, plot)
 
 
-def _voltage(
+def voltage_picture(
     response: Response, limits: AmplifierLimits, played: FloatArray | None = None
 ) -> Picture:
     """Return the voltage over time with its limits, and another one that was played."""
@@ -192,11 +176,7 @@ def _responses(
     for (rival, y), colour in zip(deviations.items(), _COLOURS * len(deviations), strict=False):
         plot.line(record.time, scale.factor * y, plain(rival), colour)
     caption = f"Where the predictions of {name} part" if several else f"Predicted {name}"
-    note = (
-        "Each rival's prediction less the mean of all, before it is fitted again; the design"
-        " maximises what such a fit leaves."
-    )
-    return Picture(caption, plot, note if several else "")
+    return Picture(caption, plot, say("design.rivals_part") if several else "")
 
 
 # Mechanisms
@@ -221,12 +201,6 @@ def write_mechanism_page(
             live = live_design(whole, (time, voltage, played.displacement), rest=True)
         except InputError as error:
             why = [f"The model does not run in this page. {error}"]
-    acts = (
-        "A mechanism acts as feedback around the mechanics (position, velocity and acceleration"
-        " by its stiffness, damping and mass); the lag stands before the loop."
-    )
-    locus = "The poles as the whole mechanism grows; those beyond the picture are in the table."
-    linear = "Linear answer in closed form, with the lag and the amplifier, without hysteresis."
     write_design_page(
         path,
         title=f"Prestress mechanism for {model.name}",
@@ -234,11 +208,11 @@ def write_mechanism_page(
         live=live,
         tables=(
             design_words.Titled("Mechanism", design_words.mechanism_table(d)),
-            design_words.Titled("Poles", design_words.pole_table(d), acts),
+            design_words.Titled("Poles", design_words.pole_table(d), say("design.acts")),
         ),
         figures=(
-            Picture("Root locus", _root_locus(d), locus),
-            Picture("Step of the rated voltage", _step(d), linear),
+            Picture("Root locus", _root_locus(d), say("design.locus")),
+            Picture("Step of the rated voltage", _step(d), say("design.linear")),
         ),
     )
 

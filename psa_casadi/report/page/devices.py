@@ -12,21 +12,16 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_write
 from psa_casadi.documents.findings import Result, read_findings
 from psa_casadi.model.component import Component
-from psa_casadi.population.finding import Finding
-from psa_casadi.population.population import Difference, Population, differences
-from psa_casadi.report.page.document import Picture, render
-from psa_casadi.report.plots import device_plots as plots
+from psa_casadi.population.population import Difference, Finding, Population, differences
+from psa_casadi.report.page.document import render
 from psa_casadi.report.words import population_words as words
-from psa_casadi.report.words.phrases import number, one_unit
+from psa_casadi.report.words.phrases import one_unit
 from psa_casadi.report.words.tables import Table
-from psa_casadi.report.words.verdict_words import VERDICTS
 
 #: More devices than this are a population.
 MOST = 20
 #: Columns of a comparison as text.
 _WIDTH = 100
-#: Devices with a tile at the top; the table has all.
-_MOST_TILES = 4
 #: Parameters that have a plot; those in which devices stand out come first.
 _MOST_PLOTS = 12
 
@@ -121,31 +116,12 @@ def write_comparison(findings: Sequence[Finding], path: str | os.PathLike[str]) 
             "comparison.html",
             f"Comparison of {len(findings)} devices",
             findings=findings,
-            verdict=words.difference_sentence(findings, rows),
-            tiles=[_tile(f) for f in findings[:_MOST_TILES]],
-            verdicts=words.verdict_table(findings, scale),
+            rows=rows,
+            scale=scale,
             warnings=[f"{f.device}: {w}" for f in findings for w in f.warnings],
-            budget=any(f.budget for f in findings)
-            and {"panel": plots.budget_plot(findings), "table": words.budget_table(findings)},
-            parameters=rows
-            and {
-                "panel": plots.difference_plot(findings, rows),
-                "table": words.difference_table(findings, rows),
-            },
-            traces=any(f.trace for f in findings) and plots.error_plots(findings),
             scales=len({f.force_scale for f in findings if f.force_scale}),
-            files=words.file_table(findings),
         )
     atomic_write(path, page)
-
-
-def _tile(f: Finding) -> tuple[str, str, str]:
-    """Return a device with its verdict and cause, or with the error of its fit."""
-    if f.verdict:
-        return f.device, VERDICTS.get(f.verdict, f.verdict), words.causes_text(f)
-    if f.rms_percent is not None:
-        return f.device, f"{number(f.rms_percent, 2)} % of range", "rms of the fit"
-    return f.device, "model", ""
 
 
 def write_population(
@@ -170,32 +146,8 @@ def write_population(
         "Population of devices",
         badges,
         p=p,
-        verdict=" ".join(words.population_sentences(p)),
-        tiles=_tiles(p, len(without)),
-        method=words.METHOD,
         **words.population_tables(p),
-        left_out=words.left_out_sentence(p),
-        spread_pictures=[
-            Picture(s.estimates.name, plots.spread_plot(p, s), s.estimates.meaning) for s in spreads
-        ],
-        drift_pictures=[
-            Picture(f"{s.estimates.name} over the date", plots.drift_plot(p, s))
-            for s in p.spreads
-            if s.estimates.name in p.drifting
-        ],
+        spread_order=spreads,
         without=Table(("device", "ended", "why"), tuple(without)) if without else None,
     )
     atomic_write(path, page)
-
-
-def _tiles(p: Population, lost: int) -> list[tuple[str, str, str]]:
-    tiles = [
-        ("devices", str(len(p.findings)), f"{lost} more without a result" if lost else ""),
-        ("stand out", str(len({o.device for o in p.outliers})), ""),
-    ]
-    if p.batch_p:
-        differ = len(p.batches_differ)
-        tiles.append(("parameters in which batches differ", str(differ), f"of {len(p.batch_p)}"))
-    if p.drift_p:
-        tiles.append(("parameters that drift", str(len(p.drifting)), f"of {len(p.drift_p)}"))
-    return tiles

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from html import escape
+from importlib import import_module
 from importlib.resources import files
 from typing import Any
 
@@ -25,7 +26,7 @@ from plotly.offline import get_plotlyjs
 from psa_casadi.common.characters import plain
 from psa_casadi.common.progress import typed
 from psa_casadi.report.plots.panel import Panel, plotly_figure
-from psa_casadi.report.words import colours, phrases, verdict_words
+from psa_casadi.report.words import colours, phrases
 from psa_casadi.report.words.tables import Table
 from psa_casadi.version import __version__
 
@@ -33,6 +34,12 @@ _HOME = "psa_casadi.report.page"
 _FIGURE = re.compile(r"[-<>]? ?[\d.,]+(e-?\d+)?( (to|%|[-\d.,]+(e-?\d+)?))*|not finite")
 _HASH = re.compile(r"[0-9a-f]{64}")
 _WIDE = 28
+#: The modules whose functions templates call.
+_IN_TEMPLATES = (
+    "plots.device_plots", "plots.figures", "plots.findings", "plots.records", "words.catalogue",
+    "words.notes", "words.phrases", "words.population_words", "words.tables", "words.text",
+    "words.verdict_words",
+)  # fmt: skip
 #: Levels of red, green and blue of a still picture: lines on paper take few, and it is small.
 _LEVELS = 16
 #: The scripts of a model that runs in a page, by what it does there, in their order.
@@ -130,8 +137,9 @@ def environment() -> Environment:
         trim_blocks=True, lstrip_blocks=True, finalize=_words,
     )  # fmt: skip
     made.globals.update(column_styles=_column_styles, still_picture=_still_picture)
+    for place in _IN_TEMPLATES:
+        made.globals[place.partition(".")[2]] = import_module(f"psa_casadi.report.{place}")
     made.filters.update(plain=phrases.plain, percent=phrases.percent, either=phrases.either)
-    made.filters.update(family=verdict_words.family_sentence)
     return made
 
 

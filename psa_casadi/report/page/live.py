@@ -203,7 +203,7 @@ def _fitted_records(
     `share` is what counts of each record's noise where errors are judged.
     """
     model, experiments, rows = result.model, result.experiments, []
-    theta, stack = fit.placed(experiments), is_stack(model)
+    theta, stack = fit.placed(), is_stack(model)
     for s in series:
         k, j = s.place
         e, channel = experiments[k], experiments[k].channels[j]

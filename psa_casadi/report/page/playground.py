@@ -75,7 +75,7 @@ def playground(model: Model | None = None) -> str:
 
 
 def _stack(model: Model, whole: Model, name: str, description: str) -> dict[str, Any]:
-    base = {p.name for c in whole.components if c.gain is None for p in c.parameters}
+    base = {p.name for c in whole.base for p in c.parameters}
     values = {n: v for n, v in model.values.items() if n in base}
     chosen = whole.with_values(values)
     return {

@@ -1,7 +1,7 @@
 """Pages of diagnoses and identifications: what their templates show, the story first."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -10,24 +10,23 @@ import numpy as np
 from psa_casadi.common.files import atomic_write
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.misfit import WORTH_SAYING, Misfit
+from psa_casadi.diagnosis.remedy import Signature, signature
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.diagnosis.signature import signature
 from psa_casadi.identification import grades
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.profile import Profile
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.component import Component
 from psa_casadi.posterior.sample import Posterior
 from psa_casadi.report.page.document import Picture, render
 from psa_casadi.report.page.live import LiveModel, live_diagnosis, live_fit
-from psa_casadi.report.plots import findings, records
-from psa_casadi.report.plots.figures import posterior_figure, record_figure, size_sentence
-from psa_casadi.report.words import fit_words, phrases, tables, text, verdict_words
-from psa_casadi.report.words.advice_words import profile_sentences
-from psa_casadi.report.words.misfit_words import AXES, weight
+from psa_casadi.report.plots import findings
+from psa_casadi.report.plots.figures import posterior_figure, record_figure
+from psa_casadi.report.words import notes, phrases, tables, text, verdict_words
+from psa_casadi.report.words.catalogue import TITLES
 from psa_casadi.report.words.phrases import added, lowered, number, plain
 from psa_casadi.report.words.remedy_words import what_now
 from psa_casadi.report.words.series import (
-    ResidualFigures,
     Series,
     most_telling,
     residual_figures,
@@ -43,11 +42,6 @@ MOST_RECORDS = 16
 _SIGNATURES, _VIEWS, _TOLD_RECORDS, _TOLD = 3, 3, 4, 6
 #: Of any model: outputs whose errors are drawn, series with a sentence, effects with bars.
 _OUTPUTS, _SERIES, _EFFECTS = 4, 4, 16
-#: What a page shows of a stack, or of some diagnoses alone.
-_OF_STACK = (
-    "stack", "answers", "views", "splits", "signatures", "columns", "gained", "blind", "noise",
-    "moved", "most", "excess", "patch",
-)  # fmt: skip
 #: Views that show nearly the same as another one: of these, and of gain and lag, one is drawn.
 _FAMILIES = {"displacement": "voltage", "from_reversal": "since_reversal"}
 
@@ -72,7 +66,7 @@ def write_report(
     stack = diagnosis if isinstance(diagnosis, StackDiagnosis) else None
     scale = phrases.scale_of(stack.experiments, stack.base_errors.holdout_rms_m) if stack else None
     with phrases.one_unit(scale):
-        atomic_write(path, _page(diagnosis, stack, origin, still, model_file))
+        atomic_write(path, _page(diagnosis, origin, still, model_file))
 
 
 def write_fit_report(
@@ -97,44 +91,25 @@ def write_fit_report(
     atomic_write(path, page)
 
 
-def _page(
-    d: Diagnosis, stack: StackDiagnosis | None, origin: str, still: bool, model_file: str | None
-) -> str:
-    series, effects = series_of(d), {c.name: c for c in d.model.components}
+def _page(d: Diagnosis, origin: str, still: bool, model_file: str | None) -> str:
+    series, stack = series_of(d), isinstance(d, StackDiagnosis)
     live = None if still else live_diagnosis(d, series)  # compiles meanwhile
-    gain = tables.error_table(d, series[0].residual_scale)
-    by_record = len(d.experiments) > 1 and not stack
-    parts = _budget(d) | (_of_stack(stack) if stack else _of_any(d, series))
-    about = f" of {plain(d.model.name)}" if not stack else ""
+    most, about = (None, "") if stack else (_EFFECTS, f" of {plain(d.model.name)}")
+    parts = _of_stack(d) if isinstance(d, StackDiagnosis) else _of_any(d, series)
     return render(
         "diagnosis.html",
         f"Diagnosis{about}: {verdict_words.VERDICTS[d.verdict]}",
         **_shared(d, series, origin),
-        **{**dict.fromkeys(_OF_STACK, ()), **parts},
+        **parts,
         d=d,
-        added=added(d),
-        verdict=verdict_words.verdict_sentence(d),
+        stack=stack,
+        series=series,
         advice=what_now(d, model_file),
+        budget=_budget(d),
         live=live,
+        most=most,
         most_records=_TOLD_RECORDS,
-        evidence=findings.evidence_plot(d, None if stack else _EFFECTS),
-        causes=[
-            {
-                "cause": c,
-                "effect": effects[c.effect],
-                "size": verdict_words.cause_size(d, c),
-                "parameters": tables.parameter_table(d.model, only=c.parameters),
-                "alternatives": [
-                    f"{phrases.raised(verdict_words.alternative_sentence(d, a))}."
-                    for a in (stack.alternatives if stack else ())
-                    if a.cause == c.effect
-                ],
-            }
-            for c in d.causes
-        ],
-        gain=[gain, tables.record_error_table(series)] if by_record else [gain],
-        rest=phrases.rest_sentence(d),
-        candidates=tables.candidate_table(d),
+        evidence=findings.evidence_plot(d, most),
     )
 
 
@@ -143,37 +118,35 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
     rows = [(s, residual_figures(s, s.curves[0])) for s in series]
     rows.sort(key=lambda row: -row[1].range_share)
     wrong = [
-        f"{s.name}: {fit_words.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
+        f"{s.name}: {notes.whiteness_sentence(f, s.curves[0].label, s.time_scale)}"
         for s, f in rows[:_SERIES]
     ]
-    errors = []
-    for e in d.errors[:_OUTPUTS]:
-        caption = f"{e.output}: error on held-out samples, rms"
-        in_unit = partial(phrases.with_its_unit, unit=e.unit)
-        errors.append(_bars(d, caption, (e.base, e.extended, e.noise), in_unit))
-    wrong = [d.missed.where, *wrong]
-    return {"errors": errors, "wrong": [[wrong], []], "most": _EFFECTS, "moved": d.moved}
+    captions = [f"{e.output}: error on held-out samples, rms" for e in d.errors]
+    errors = [
+        (caption, (e.base, e.extended, e.noise), partial(phrases.with_its_unit, unit=e.unit))
+        for caption, e in zip(captions[:_OUTPUTS], d.errors, strict=False)
+    ]
+    return {
+        "errors": errors,
+        "noise_from": "",
+        "wrong": [[[d.missed.where, *wrong]], []],
+        **dict.fromkeys(("views", "splits", "signatures"), ()),
+    }
 
 
 def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
     """Return what the page shows of a stack alone."""
     span = max(e.record.range_m for e in d.experiments)
-    e, x = d.base_errors, d.extended_errors
-    scale = phrases.scale_of(d.experiments, e.holdout_rms_m)
+    scale = phrases.scale_of(d.experiments, d.base_errors.holdout_rms_m)
     reach = phrases.handy_scale(span, counts=scale.unit == "counts").text(span)
-    sources = phrases.listing(list(dict.fromkeys(n.source for n in d.noise)))
-    estimated = f" It is estimated from: {sources}." if sources else ""
+    sources = phrases.listing(dict.fromkeys(n.source for n in d.noise))
     caption = f"Error on held-out samples, rms; the displacement's range is {reach}"
-    rms = e.holdout_rms_m, x.holdout_rms_m, d.noise_floor_rms_m
-    answers = (("Remains", phrases.rest_sentence(d)), ("Next", d.next_experiment.why))
-    gained = verdict_words.gain_sentence(d) if added(d) else "nothing was added to the base model"
-    own_voltages = added(d) and not d.gain.held_out_records
+    rms = d.base_errors.holdout_rms_m, d.extended_errors.holdout_rms_m, d.noise_floor_rms_m
     return {
-        "stack": True,
-        "errors": [_bars(d, caption, rms, scale.text, estimated)],
-        "answers": [f"{label}: {text}" for label, text in answers if text],
+        "errors": [(caption, rms, scale.text)],
+        "noise_from": f" It is estimated from: {sources}." if sources else "",
         "wrong": [
-            [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -weight(m))]
+            [m.sentences[:_TOLD] for m in sorted(misfits, key=lambda m: -text.weight(m))]
             for misfits in (d.misfit, d.remainder)
         ],
         "views": [p for m, name in drawn(d.misfit) if (p := _data_view(d, m, name)) is not None],
@@ -183,10 +156,6 @@ def _of_stack(d: StackDiagnosis) -> dict[str, Any]:
             if (table := split_table(m, *_compared(d, m))) is not None
         ],
         "signatures": [s for c in d.causes[:_SIGNATURES] if (s := _signature(d, c.effect))],
-        "columns": tables.column_table(d) if d.columns else None,
-        "gained": [f"{phrases.raised(gained)}.", *([verdict_words.OWN_VOLTAGES] * own_voltages)],
-        "blind": tables.blind_table(d),
-        "noise": [n.sentence for n in d.noise],
     }
 
 
@@ -206,39 +175,27 @@ def fit_page(
     stack = identification if isinstance(identification, StackIdentification) else None
     with phrases.one_unit(scale if stack else None):
         figures = [residual_figures(s, s.curves[0]) for s in series]
-        graded, tiles = grades.grades(identification), []
-        error = text.fit_sentence(identification) if stack is None else ""
+        graded, sizes = grades.grades(identification), dict[str, Any]()
         if stack:
             noise = float(np.sqrt(np.mean([f.noise**2 for f in figures])))
             span = max(e.record.range_m for e in identification.experiments)
-            error = fit_words.error_sentence(identification.fit.rms, noise, span, scale, origin)
-            largest = max(f.largest for f in figures)
-            tiles = [
-                (f"error, {what}", scale.text(v), f"{number(100.0 * v / span, 2)} % of the range")
-                for what, v in (("rms", identification.fit.rms), ("largest", largest))
-            ]
-            tiles.append(("noise, rms", scale.text(noise), "from fast differences"))
-        if fitted := sum(g.degree != "fixed" for g in graded):
-            count = f"{len(grades.named(graded, 'determined'))} of {fitted}"
-            tiles.append(("parameters determined", count, "to 10 % or better"))
+            error = notes.error_sentence(identification.fit.rms, noise, span, scale, origin)
+            sizes = {"noise": noise, "span": span, "largest": max(f.largest for f in figures)}
+        else:
+            error = text.fit_sentence(identification)
         return render(
             "fit.html",
             f"Identification of {'a stack' if stack else plain(identification.model.name)}",
             **_shared(identification, series, origin),
-            identification=identification,
-            combinations=stack.combinations if stack else (),
-            further=stack.advice if stack else (),
-            verdict=f"{error} {fit_words.determined_sentence(graded)}",
-            tiles=tiles,
+            **sizes,
+            verdict=f"{error} {notes.determined_sentence(graded)}",
+            stack=stack,
             live=live,
-            determined=_determined(identification, graded),
-            profiles=[
-                Picture(
-                    f"Profile of {p.name}", findings.profile_plot(p), " ".join(profile_sentences(p))
-                )
-                for p in profiles
-            ],
-            starts=tables.starts_table(identification.starts, series[0].residual_scale),
+            scale=scale,
+            graded=graded,
+            grades=grades,
+            profiles=profiles,
+            first_scale=series[0].residual_scale,
             errors=tables.fit_error_table(series, figures),
         )
 
@@ -248,20 +205,11 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
 
     Raises InputError when `path` cannot be written to.
     """
-    experiments, name = posterior.task.experiments, plain(posterior.model.name)
-    records = phrases.counted(len(experiments), "record")
-    page = render(
-        "posterior.html",
-        f"Posterior of {name}",
-        [records],
-        posterior=posterior,
-        verdict=f"The posterior of {name}, given {records}: {text.drawn(posterior)}.",
-        figure=posterior_figure(posterior),
-        parameters=text.posterior_table(posterior),
-        left=text.left_table(posterior),
-        used=tables.record_table(experiments, "measured"),
-    )
-    atomic_write(path, page)
+    name = plain(posterior.model.name)
+    records = phrases.counted(len(posterior.task.experiments), "record")
+    verdict = f"The posterior of {name}, given {records}: {text.drawn(posterior)}."
+    options = {"posterior": posterior, "verdict": verdict, "figure": posterior_figure(posterior)}
+    atomic_write(path, render("posterior.html", f"Posterior of {name}", [records], **options))
 
 
 def _shared(
@@ -271,37 +219,25 @@ def _shared(
 
     On the page of a fit the former appears only if no script runs.
     """
-    model = result.model
     identification = result if isinstance(result, Identification) else None
     figures = [residual_figures(s, s.curves[-1]) for s in series]
     order = sorted(range(len(series)), key=lambda k: -figures[k].range_share)
     worst = most_telling(series)
-    limit = points_each(len(series))
-    curves = phrases.listing([origin, *(c.label for c in worst.curves)])
-    below = Picture(
-        f"{worst.name}: {curves}",
-        records.time_plot(worst, origin, limit),
-        f"Below: the residual; dashed: two standard deviations of the noise.{_shaded(worst)}",
-    )
     stack = result if isinstance(result, StackIdentification) else None
-    known = grades.determined(model, stack)
-    others = [n for n in model.parameter_names if n not in known]
     return {
         "badges": [f"{origin} data", phrases.counted(len(result.experiments), "record")],
         "origin": origin,
         "worst": worst,
+        "limit": points_each(len(series)),
         "still": record_figure(worst, origin=origin),
-        "below": below,
         "parts": [
-            _part(s, figures[k], origin, limit, identification or s.name != worst.name)
+            (s, figures[k], identification is not None or s.name != worst.name)
             for k, s in enumerate(series)
             if k in order[:MOST_RECORDS]
         ],
         "count": len(series),
-        "parameters": {
-            name: tables.parameter_table(model, identification, only) if only else None
-            for name, only in (("known", known), ("others", others))
-        },
+        "identification": identification,
+        "known": grades.determined(result.model, stack),
         "used": tables.record_table(result.experiments, origin),
     }
 
@@ -311,67 +247,19 @@ def points_each(count: int) -> int:
     return _MOST_SAMPLES // min(MOST_RECORDS, max(1, count))
 
 
-def _shaded(s: Series) -> str:
-    return " Shaded: held out." if s.held_out.any() else ""
-
-
-def _part(
-    s: Series, figures: ResidualFigures, origin: str, limit: int, timed: Any
-) -> dict[str, Any]:
-    """Return the views of a record and its residual; over time only if it is `timed`."""
-    noise = "Dashed: two standard deviations of the noise."
-    driver = s.against.partition(" [")[0]
-    indices = records.samples(s, limit)
-    over_it = [
-        Picture(f"Loop: {s.quantity} over {driver}", records.loop_plot(s, origin, indices)),
-        Picture(f"Residual over {driver}", records.error_loop_plot(s, limit), noise),
-    ]
-    views = [
-        Picture("Where the difference is easiest to see", records.zoom_plot(s, origin, limit)),
-        Picture("Spectrum of the residual", records.spectrum_plot(s, limit),
-                "Dashed: white noise of the record's noise level."),
-        Picture("Autocorrelation of the residual", records.autocorrelation_plot(s),
-                "Dashed: 95 % of the lags of white noise lie between these lines."),
-        Picture("Distribution of the residual", records.distribution_plot(s),
-                "Dashed: normal distribution of the same mean and standard deviation."),
-    ]  # fmt: skip
-    caption = f"{s.title}, and residual: {origin} minus model"
-    over_time = Picture(caption, records.time_plot(s, origin, limit), f"{noise}{_shaded(s)}")
-    return {
-        "name": s.name,
-        "title": s.title,
-        "sentence": fit_words.residual_sentence(figures, s.curves[-1].label, s.time_scale),
-        "over_time": over_time if timed else None,
-        "views": [*(over_it if driver else []), *views],
-    }
-
-
-def _bars(
-    d: Diagnosis, caption: str, errors: tuple[float, float, float],
-    text: Callable[[float], str], note: str = "",
-) -> dict[str, Any]:  # fmt: skip
-    """Return held-out errors as bars over the noise, which no model can go below."""
-    names = (("base model", "--base"), ("extended model", "--extended"), ("noise", "--noise"))
-    rows = [(name, e, colour, text(e)) for (name, colour), e in zip(names, errors, strict=True)]
-    rows = rows if added(d) else [rows[0], rows[2]]
-    return {"caption": caption, "rows": rows, "noise": errors[-1], "note": note}
-
-
-def _budget(d: Diagnosis) -> dict[str, Any]:
-    """Return the error budget, and what the unnamed correction adds."""
+def _budget(d: Diagnosis) -> tuple[str | None, Picture | None] | None:
+    """Return the excess of a stack, and what the unnamed correction adds; None without either."""
     b, excess, patch = d.budget, None, None
     if isinstance(b, StackBudget):
         if b.excess_rms_m <= 0.0:
-            return {"budget": None}
+            return None
         excess = phrases.scale_of(d.experiments, b.excess_rms_m).text(b.excess_rms_m)
     elif not added(d) and d.patch is None:
-        return {"budget": None}
+        return None
     if d.patch is not None:
         coordinate, plot = findings.correction_plot(d, d.patch)
-        caption = f"Unnamed correction: {d.patch.name}, over {coordinate}"
-        patch = {"text": verdict_words.patch_text(d.patch), "picture": Picture(caption, plot)}
-    rest = {"patch": patch, "families": d.families}
-    return {"budget": verdict_words.budget_table(d), "excess": excess, **rest}
+        patch = Picture(f"Unnamed correction: {d.patch.name}, over {coordinate}", plot)
+    return excess, patch
 
 
 def drawn(misfits: Sequence[Misfit]) -> tuple[tuple[Misfit, str], ...]:
@@ -412,7 +300,7 @@ def _data_view(d: StackDiagnosis, m: Misfit, name: str) -> Picture | None:
     after = findings.view_named(extended, name) if extended else None
     plot = findings.view_plot(before, after, counts=counts)
     share = f", {phrases.percent(before.share)} of the excess" if before.significant else ""
-    return Picture(f"{m.record}: {lowered(AXES[before.name].title)}{share}", plot)
+    return Picture(f"{m.record}: {lowered(TITLES[before.name])}{share}", plot)
 
 
 def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Table | None:
@@ -433,19 +321,13 @@ def split_table(before: Misfit, after: Misfit | None, counts: bool) -> tables.Ta
     return tables.Table(tuple(head), tuple(rows))
 
 
-def _signature(d: StackDiagnosis, name: str) -> dict[str, Any] | None:
+def _signature(d: StackDiagnosis, name: str) -> tuple[Component, Signature, Any] | None:
     """Return the signature of a cause with the same view of the record that shows most of it."""
     effect = next((c for c in d.model.components if c.name == name), None)
     if effect is None or effect.more_of:  # several modes look as their tones make them look
         return None
     expected = signature(effect)
-    view, note = expected.telling.name, size_sentence(expected)
-    if view == "holds":
-        note += " Counted from the beginning of the hold, in the direction of the last change."
-    caption = f"{plain(name).capitalize()}, simulated: {lowered(AXES[view].title)}"
-    pictures = [Picture(caption, findings.signature_plot(expected), note), _of_the_data(d, view)]
-    there = [p for p in pictures if p is not None]
-    return {"name": plain(name), "looks_like": effect.looks_like, "pictures": there}
+    return effect, expected, _of_the_data(d, expected.telling.name)
 
 
 def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
@@ -463,18 +345,6 @@ def _of_the_data(d: StackDiagnosis, name: str) -> Picture | None:
     else:
         strongest = drawn(d.misfit)
         data = _data_view(d, *strongest[0]) if strongest else None
-        axis = AXES[name].title.lower()
+        axis = TITLES[name].lower()
         note = f"No record has {axis} to compare; this is the view that shows most."
     return None if data is None else Picture(data.caption, data.panel, note)
-
-
-def _determined(identification: Identification, graded: tuple[grades.Grade, ...]) -> list[Picture]:
-    if not identification.determinacy.names:
-        return []
-    errors, note = findings.determinacy_plot(graded), fit_words.error_bar_note(graded)
-    pictures = [Picture("Relative standard error of each parameter", errors, note)]
-    if len(identification.determinacy.names) > 1:
-        words = fit_words.pairs_sentence(grades.strong_pairs(identification))
-        plot = findings.correlation_plot(identification)
-        pictures.append(Picture("Correlation of the estimates", plot, words))
-    return pictures

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from psa_casadi.common.units import FloatArray, convert
-from psa_casadi.population.finding import NORMAL_95, Finding
-from psa_casadi.population.population import Difference, Population, Spread, display_unit
+from psa_casadi.model.variables import NORMAL_95
+from psa_casadi.population.population import Difference, Finding, Population, Spread, display_unit
 from psa_casadi.population.statistics import mixed_regression
 from psa_casadi.report.plots.panel import Panel
 from psa_casadi.report.words import colours

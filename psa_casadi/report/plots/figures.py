@@ -16,8 +16,8 @@ from psa_casadi.common.errors import InputError
 from psa_casadi.common.files import atomic_path
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.linear import Linear
+from psa_casadi.diagnosis.remedy import Signature
 from psa_casadi.diagnosis.result import Diagnosis, StackDiagnosis
-from psa_casadi.diagnosis.signature import Signature
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.component import Component
@@ -30,7 +30,7 @@ from psa_casadi.report.plots import records
 from psa_casadi.report.plots.findings import evidence_plot, signature_plot
 from psa_casadi.report.plots.panel import FONT, Panel, draw, sheet, style
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.catalogue import TITLES
 from psa_casadi.report.words.series import (
     Series,
     most_telling,
@@ -49,27 +49,17 @@ Plotted = Compared | Trajectory | Posterior | Signals
 SIZE_INCHES, DPI = (16.0, 10.0), 100
 #: Room around the plots of a still picture, for labels of any size that they have there.
 _STILL_ROOM = {
-    "left": 0.075,
-    "right": 0.99,
-    "top": 0.935,
-    "bottom": 0.09,
-    "hspace": 0.42,
-    "wspace": 0.3,
-}
+    "left": 0.075, "right": 0.99, "top": 0.935, "bottom": 0.09, "hspace": 0.42, "wspace": 0.3,
+}  # fmt: skip
 #: Samples of a record, bars of effects for which there is room, parameters and their bins.
 _MOST_POINTS, _MOST_BARS, _MOST_PARAMETERS, _BINS = 8000, 9, 12, 40
 _COLUMNS = 4
 #: Outputs or columns of a record in one picture.
 _MOST_ROWS = 8
 #: A legend above the plot, right of its title, and one over the curves.
-_ABOVE = {
-    "fontsize": FONT - 1.5, "ncols": 4, "loc": "lower right", "bbox_to_anchor": (1.0, 0.98),
-    "frameon": False, "columnspacing": 1.2, "handlelength": 1.4,
-}  # fmt: skip
-_OVER = {
-    "fontsize": FONT - 1.5, "ncols": 4, "loc": "upper center", "columnspacing": 1.2,
-    "handlelength": 1.4,
-}  # fmt: skip
+_LEGEND = {"fontsize": FONT - 1.5, "ncols": 4, "columnspacing": 1.2, "handlelength": 1.4}
+_OVER = _LEGEND | {"loc": "upper center"}
+_ABOVE = _LEGEND | {"loc": "lower right", "bbox_to_anchor": (1.0, 0.98), "frameon": False}
 
 
 def save_figure(
@@ -148,7 +138,7 @@ def record_figure(s: Series, *, origin: str = "measured") -> Figure:
     return figure
 
 
-def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Figure:
+def outputs_figure(outputs: Sequence[Series]) -> Figure:
     """Return the picture of several outputs of one record: measured against model, residual."""
     outputs = outputs[:_MOST_ROWS]
     figure = sheet((12.0, 2.6 * len(outputs)), 80)
@@ -156,11 +146,11 @@ def outputs_figure(outputs: Sequence[Series], *, origin: str = "measured") -> Fi
     for s, (left, right) in zip(outputs, grid, strict=True):
         indices = records.samples(s, _MOST_POINTS)
         legend = _ABOVE if s is outputs[0] else None
-        draw(left, records.measured_plot(s, origin, indices), legend=legend)
+        draw(left, records.measured_plot(s, "measured", indices), legend=legend)
         left.margins(x=0.01)
         draw(right, records.residual_plot(s, indices), f"Residual of {s.title}")
         right.margins(x=0.01)
-    figure.suptitle(f"{origin} record: {outputs[0].record}", fontsize=FONT)
+    figure.suptitle(f"measured record: {outputs[0].record}", fontsize=FONT)
     return figure
 
 
@@ -479,7 +469,7 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     draw(left, added_over_time, "What the effect adds, over time")
     left.margins(x=0.01)
     view = signature.telling
-    title = f"{AXES[view.name].title}: explains {phrases.percent(view.share)} of it"
+    title = f"{TITLES[view.name]}: explains {phrases.percent(view.share)} of it"
     if view.name == "spectrum":
         title = f"Spectrum: {phrases.percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}

@@ -6,16 +6,15 @@ import numpy as np
 
 from psa_casadi.common.units import FloatArray, convert
 from psa_casadi.diagnosis.corrections import Correction, FreeFunction, Patch
-from psa_casadi.diagnosis.misfit import Misfit, Spectrum
+from psa_casadi.diagnosis.misfit import Misfit, Spectrum, View
+from psa_casadi.diagnosis.remedy import Signature
 from psa_casadi.diagnosis.result import Candidate, Diagnosis
-from psa_casadi.diagnosis.signature import Signature
-from psa_casadi.diagnosis.views import View
 from psa_casadi.identification.grades import DEGREES, WEAK_ERROR, Grade
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile
 from psa_casadi.identification.result import Identification
 from psa_casadi.report.plots.panel import Panel, logarithmic
 from psa_casadi.report.words import colours, phrases
-from psa_casadi.report.words.misfit_words import AXES
+from psa_casadi.report.words.catalogue import LABELS
 from psa_casadi.report.words.series import bar_colour
 
 #: The colours of the degrees of determinacy, in their order.
@@ -139,9 +138,7 @@ def _view_panel(
 ) -> tuple[Panel, float]:
     """Return an empty plot of a view, and the factor from its coordinate to the axis."""
     unit, factor = ("µm", 1e6) if view.x_unit == "m" else (view.x_unit, 1.0)
-    plot = Panel(
-        f"{AXES[view.name].label} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True
-    )
+    plot = Panel(f"{LABELS[view.name]} [{unit}]", f"{what} [{scale.unit}]", _LOW, showlegend=True)
     if view.name.startswith(("since_reversal", "holds", "spectrum")):
         plot.axes(logarithmic(_ends(factor * np.concatenate(arrays))))
     return plot.axes(y={"zeroline": True, "zerolinecolor": colours.NOISE}), factor

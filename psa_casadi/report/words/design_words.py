@@ -7,26 +7,16 @@ import numpy as np
 from psa_casadi.design.experiment.experiment import CHANCE, PLAYS, Informative, Separated
 from psa_casadi.design.mechanism.mechanism import MechanismDesign
 from psa_casadi.design.tracking.targets import AmplifierLimits, Response, TrackingError, usage
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import (
     in_display_unit,
     interval_text,
-    listing,
     number,
-    percent,
     plain,
     probability_text,
 )
 from psa_casadi.report.words.tables import Table
 from psa_casadi.simulation.start import is_stack
-
-_FAMILIES = {
-    "free": "free-form, linear between corners",
-    "triangles": "triangles between reversal points",
-    "steps": "steps and holds",
-    "multisine": "multisine",
-    "sine": "sine (no designed input was better)",
-    "triangle": "triangle (no designed input was better)",
-}
 
 
 @dataclass(frozen=True)
@@ -43,60 +33,33 @@ def sentences(design: Separated | Informative) -> tuple[str, ...]:
     model = design.rivals[0].model
     capacitance = model.values.get("C_p") if is_stack(model) else None
     promises = _chances(design) if isinstance(design, Separated) else (_narrower(design),)
-    record, parts = design.record, []
+    record, parts, several = design.record, [], len(design.record.columns) > 1
     for name, values in record.columns.items():
-        unit = record.units[name]
+        unit = "" if record.units[name] == "1" else f" {record.units[name]}"
         rate = float(np.max(np.abs(np.diff(values) / np.diff(record.time))))
-        current = f", {number(1e3 * capacitance * rate)} mA into the stack" if capacitance else ""
-        in_unit = "" if unit == "1" else f" {unit}"
-        per_second = f"{in_unit} a second" if in_unit == "" or "/" in unit else f"{in_unit}/s"
-        named = f"{name} " if len(record.columns) > 1 else ""
-        parts.append(
-            f"{named}{number(values.min())} to {number(values.max())}{in_unit}, at most"
-            f" {number(rate)}{per_second}{current}"
-        )
-    inputs = (
-        f"{_FAMILIES[design.kind].capitalize()}: {record.n} samples in"
-        f" {number(record.n * record.sample_time)} s, {'; '.join(parts)}."
-    )
-    return (*promises, inputs)
+        ends = {"least": values.min(), "most": values.max(), "rate": rate, "unit": unit}
+        current = 1e3 * capacitance * rate if capacitance else None
+        parts.append(say("design.column", several=several, name=name, current=current, **ends))
+    return *promises, say("design.input", design=design, record=record, parts=parts)
 
 
 def _chances(design: Separated) -> tuple[str, ...]:
     """Say how surely the record names each effect if it is the cause, and what would be sure."""
     parts = [f"{plain(n)} with {probability_text(p)}" for n, p in design.chance.items()]
     usual = [f"{number(design.factor(n), 2)} times what a {n} gives" for n in design.usual_chance]
-    text = (
-        f"It is predicted to name the cause, if that is {listing(parts, 'or')}; the least ln of"
-        f" the Bayes factor between two of them grows by"
-        f" {number(min(p.designed for p in design.pairs))}, {listing(usual)} of the same length"
-        " and amplitude."
-    )
+    least = min(p.designed for p in design.pairs)
+    text = say("design.chances", parts=parts, usual=usual, least=least)
     if design.plays == 1:
         return (text,)
     if design.plays is None:
-        again = (
-            f"No record was found that is predicted to decide with {percent(CHANCE)}, not even one"
-            f" that is repeated {PLAYS[-1]} times: within these limits the effects look alike."
-            " Widen the range of the inputs or the band, make the record longer, or lower the"
-            " noise of the sensor."
-        )
-    else:
-        again = (
-            f"One run may not decide; {design.plays} runs, each from rest and recorded on its"
-            f" own, are predicted to name the cause with {percent(CHANCE)} or more."
-        )
-    return text, again
+        return text, say("design.indecisive", chance=CHANCE, most=PLAYS[-1])
+    return text, say("design.several_runs", chance=CHANCE, plays=design.plays)
 
 
 def _narrower(design: Informative) -> str:
     """Say by how much the intervals are narrower than with the usual voltages."""
     parts = [f"{number(f, 2)} times narrower than with a {n}" for n, f in design.factor.items()]
-    kinds = {"D": "volume", "A": "mean square", "E": "worst direction"}
-    return (
-        f"{design.optimality}-optimal ({kinds[design.optimality]} of the confidence region):"
-        f" intervals {listing(parts)} of the same length and amplitude."
-    )
+    return say("design.narrower", design=design, parts=parts)
 
 
 def design_tables(design: Separated | Informative) -> tuple[Titled, ...]:
@@ -115,12 +78,8 @@ def design_tables(design: Separated | Informative) -> tuple[Titled, ...]:
     ]
     head = ("if it is", "over", "designed [ln]", *(f"{n} [ln]" for n in usual))
     named = ("if it is", "named after designed", *(f"after {u}" for u in usual))
-    note = (
-        "Each other effect is fitted again, as far as the data at hand let it; the true one is"
-        " taken a standard error weaker than it was fitted."
-    )
     return (
-        Titled("Growth of ln of the Bayes factor", Table(head, tuple(pairs)), note),
+        Titled("Growth of ln of the Bayes factor", Table(head, tuple(pairs)), say("design.pairs")),
         Titled("Probability of being named", Table(named, tuple(chances))),
     )
 
@@ -181,27 +140,10 @@ def _pole(pole: complex) -> str:
 
 def mechanism_sentences(d: MechanismDesign) -> tuple[str, ...]:
     """Return the result in sentences: reached or not, the binding limits, the lag's pole."""
-    wanted = " and ".join(d.goals)
-    if d.attained:
-        first = f"Wanted {wanted}: reached within the limits."
-    else:
-        at = f"; the design stands at its limit of {' and '.join(d.binding)}" if d.binding else ""
-        first = f"Wanted {wanted}: out of reach{at}. This comes as near as it can."
-    corner = -d.lag_pole / (2.0 * np.pi)
-    lag = (
-        f"The lag's pole at {number(d.lag_pole, 4)} rad/s ({number(corner, 4)} Hz) stands outside"
-        " the loop: no mechanism moves it."
-    )
-    if corner < d.reached.bandwidth:
-        lag += " It is slower than the mechanics, so that it sets the bandwidth of the whole."
-    sentences = [first, lag]
-    if d.acts_on == "tip":
-        sentences.append(
-            "The mechanism acts on the output mass only; in a stack without reciprocal coupling the"
-            " wafers' poles stay where they are."
-        )
-    sentences.append(f"{d.agreeing} of {d.starts} starts of the search led to this design.")
-    return tuple(sentences)
+    corner, bandwidth = -d.lag_pole / (2.0 * np.pi), d.reached.bandwidth
+    tip = [say("design.at_tip")] if d.acts_on == "tip" else []
+    lag = say("design.lag", pole=d.lag_pole, corner=corner, bandwidth=bandwidth)
+    return say("design.mechanism", d=d), lag, *tip, say("design.agreeing", d=d)
 
 
 def error_table(rows: list[tuple[str, TrackingError]]) -> Titled:

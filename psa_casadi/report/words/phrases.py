@@ -8,7 +8,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 
 from psa_casadi.common.units import convert
-from psa_casadi.diagnosis.result import Candidate, Cause, Diagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -69,10 +69,7 @@ def handy_scale(largest: float, *, counts: bool = False) -> Scale:
     """Return the unit in which a length of size `largest` [m] is a handy number."""
     if counts:
         return Scale("counts", 1.0)
-    for unit, size in (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9)):
-        if largest >= 0.5 * size:
-            return Scale("µm" if unit == "um" else unit, 1.0 / size)
-    return Scale("nm", 1e9)
+    return prefixed_scale(min(max(1e-9, largest), 0.1), "m")  # never in metres
 
 
 def prefixed_scale(largest: float, unit: str) -> Scale:
@@ -164,6 +161,11 @@ def lowered(text: str) -> str:
     return f"{text[:1].lower()}{text[1:]}"
 
 
+def within(share: float) -> float:
+    """Return a share cut to 0 and 1."""
+    return max(0.0, min(1.0, share))
+
+
 def probability_text(probability: float) -> str:
     """Return a probability as a percentage that is neither 0 nor 100."""
     if probability < 0.005:
@@ -185,24 +187,6 @@ def confidence_text(confidence: float) -> str:
     return f"confidence {percent(confidence)}: {words}"
 
 
-def share_text(candidate: Candidate, d: Diagnosis) -> str:
-    """Return the share of the excess that an effect explains alone, or that it was only screened.
-
-    Of one of several named causes also what it removes together with the others.
-    """
-    if not candidate.fitted and candidate.explained_share == 0:
-        alone = "screened"
-    elif candidate.explained_share < 0:
-        alone = "fits worse"
-    else:
-        screened = "" if candidate.fitted else " (screened)"
-        alone = f"{percent(candidate.explained_share)}{screened}"
-    if len(d.causes) < 2 or candidate.effect not in {c.effect for c in d.causes}:
-        return alone
-    share = next((c for c in d.budget.causes if c.what == candidate.effect), None)
-    return alone if share is None else f"{alone}; with others {share.percents[0]} %"
-
-
 def rest_sentence(d: Diagnosis) -> str:
     """Say what remains, with the p value of the test of the rest."""
     p = d.remaining.p_value
@@ -219,9 +203,10 @@ MOST_NAMES = 5
 
 
 def listing(
-    words: Sequence[str], joint: str = "and", between: str = ",", *, most: int | None = None
+    each: Iterable[str], joint: str = "and", between: str = ",", *, most: int | None = None
 ) -> str:
     """Return "a, b and c", or "a, b and 7 more" of more words than `most`."""
+    words = list(each)
     if most is not None and len(words) > most:
         return f"{', '.join(words[:most])} {joint} {len(words) - most} more"
     if len(words) < 2:
@@ -232,11 +217,6 @@ def listing(
 def counted(count: int, noun: str) -> str:
     """Return a count with its noun, such as "2 records"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def are(names: Sequence[str], between: str = ", ") -> str:
-    """Return names with "is" or "are" behind them."""
-    return f"{between.join(names)} {'is' if len(names) == 1 else 'are'}"
 
 
 def either(effects: Sequence[str]) -> str:

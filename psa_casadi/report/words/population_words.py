@@ -5,9 +5,11 @@ from collections.abc import Sequence
 
 from psa_casadi.common.units import convert
 from psa_casadi.diagnosis.held_out import Share
+from psa_casadi.model.variables import NORMAL_95
 from psa_casadi.population import population
-from psa_casadi.population.finding import NORMAL_95, Finding
+from psa_casadi.population.population import Finding
 from psa_casadi.population.statistics import FEWEST
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import (
     Scale,
     either,
@@ -27,16 +29,7 @@ from psa_casadi.report.words.verdict_words import VERDICTS
 _LENGTH = "displacement"
 #: Names in a sentence, at most; the table has all.
 _MOST_NAMED = 6
-METHOD = (
-    "Every estimate comes with the interval of its own fit. The spread tau of the devices is what"
-    " the estimates scatter beyond that (Paule and Mandel 1982; interval by the Q profile,"
-    " Viechtbauer 2007); means have Knapp and Hartung's intervals (2003). A device stands out"
-    " where the others, without those that stand out already, do not predict it (leave one out,"
-    " Student's t; p values"
-    " adjusted over all devices and parameters, Benjamini and Hochberg 1995). Batches are compared"
-    " by an F test with the spread within batches; drift is a weighted regression on the date with"
-    " tau."
-)
+METHOD = say("devices.method")
 
 
 class _ParameterText:
@@ -78,42 +71,19 @@ def _p(p: float | None) -> str:
 
 def population_sentences(p: population.Population) -> tuple[str, ...]:
     """Return the main findings, a sentence each."""
-    devices = list(dict.fromkeys(o.device for o in p.outliers))
-    if devices:
-        verb, named = "stands" if len(devices) == 1 else "stand", listing(devices, most=_MOST_NAMED)
-        first = f"{len(devices)} of {len(p.findings)} devices {verb} out: {named}."
-    else:
-        first = f"None of {len(p.findings)} devices stands out beyond noise and spread."
-    sentences = [first]
-    if p.batch_p:
-        sentences.append(
-            f"Batches differ in {listing(p.batches_differ)}."
-            if p.batches_differ
-            else "Batches do not differ beyond the spread of their devices."
-        )
-    if p.drift_p:
-        sentences.append(
-            f"Over the date, {listing(p.drifting)} {'drifts' if len(p.drifting) == 1 else 'drift'}."
-            if p.drifting
-            else "No parameter drifts over the date beyond noise and spread."
-        )
-    for c in p.causes[:1]:
-        cause = f"The most frequent cause is {plain(c.what)}"
-        sentences.append(f"{cause}: {c.count} of {c.of} devices.")
+    devices, count = list(dict.fromkeys(o.device for o in p.outliers)), len(p.findings)
+    sentences = [say("devices.outliers", devices=devices, count=count, most=_MOST_NAMED)]
+    sentences += [say("devices.batches", names=p.batches_differ)] if p.batch_p else []
+    sentences += [say("devices.drift", names=p.drifting)] if p.drift_p else []
+    sentences += [say("devices.cause", c=c) for c in p.causes[:1]]
     return (*sentences, *missed_sentences(p.findings))
 
 
 def missed_sentences(findings: Sequence[Finding]) -> tuple[str, ...]:
     """Return which devices' fits miss their records, a sentence; none where no fit does."""
     rows = sorted((-f.noise_ratio, f.device) for f in findings if f.noise_ratio is not None)
-    if not rows:
-        return ()
-    named = [f"{device} ({number(-times, 2)} times the noise)" for times, device in rows]
-    fits, their, miss = ("fit", "its", "misses") if len(rows) == 1 else ("fits", "their", "miss")
-    return (
-        f"The {fits} of {listing(named, most=_MOST_NAMED)} {miss} {their} records: the model lacks"
-        f" something, {their} values bend to it, and {their} intervals are too short.",
-    )
+    each = [f"{device} ({number(-times, 2)} times the noise)" for times, device in rows]
+    return (say("devices.missed", each=each, most=_MOST_NAMED),) if rows else ()
 
 
 def population_tables(p: population.Population) -> dict[str, Table]:
@@ -179,25 +149,15 @@ def _counts(what: str, rows: Sequence[population.Frequency]) -> Table:
 
 def left_out_sentence(p: population.Population) -> str:
     """Name the parameters that too few devices determine, "" where there are none."""
-    if not p.left_out:
-        return ""
-    return f"Determined by {FEWEST} devices or fewer, and left out here: {listing(p.left_out)}."
+    names = p.left_out
+    return say("devices.left_out", fewest=FEWEST, names=names) if names else ""
 
 
 def difference_sentence(findings: Sequence[Finding], rows: Sequence[population.Difference]) -> str:
     """Say which parameters differ beyond noise, how the verdicts do, and which fits miss."""
+    names = [d.estimates.name for d in rows]
     differing = [d.estimates.name for d in rows if d.differs]
-    if not rows:
-        sentence = "The files share no parameter that two devices determine."
-    elif differing:
-        verb = "differ" if len(differing) > 1 else "differs"
-        compared = f"{len(rows)} parameter{'s' * (len(rows) > 1)} compared"
-        sentence = f"Beyond noise, {listing(differing)} {verb} ({compared})."
-    elif len(rows) == 1:
-        sentence = f"The one parameter that they share, {rows[0].estimates.name}, does not differ"
-        sentence += " beyond noise."
-    else:
-        sentence = f"None of the {len(rows)} parameters differs beyond noise."
+    sentence = say("devices.differences", names=names, differing=differing)
     if len({f.verdict for f in findings if f.verdict}) > 1:
         named = [f"{f.device}: {VERDICTS.get(f.verdict, f.verdict)}" for f in findings if f.verdict]
         sentence += f" Verdicts differ ({listing(named)})."

@@ -5,6 +5,7 @@ import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
+from typing import Any
 
 from psa_casadi.diagnosis.held_out import StackBudget
 from psa_casadi.diagnosis.remedy import Size
@@ -13,6 +14,7 @@ from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import STACKS
+from psa_casadi.report.words.catalogue import TABLES, say
 from psa_casadi.report.words.phrases import (
     Scale,
     added,
@@ -29,94 +31,12 @@ from psa_casadi.report.words.phrases import (
     scale_of,
     with_its_unit,
     with_unit,
+    within,
 )
-from psa_casadi.report.words.verdict_words import within
 
-_FEED_FORWARD = "correct the voltage by the extended model (feed-forward)"
-
-#: What can be done. Those below the comment are the kinds of effects of any other model.
-DO: Mapping[str, str] = {
-    "extended_model": "Use the extended model in the place of the base",
-    "wait_or_feed_forward": (
-        f"Wait until it has died out, close a loop around a position sensor, or {_FEED_FORWARD}"
-    ),
-    "undo_hysteresis": (
-        f"Approach every position from the same side, {_FEED_FORWARD} or by a hysteresis"
-        " compensator, drive the charge instead of the voltage, or close a loop"
-    ),
-    "undo_curve": f"Use less of the range, {_FEED_FORWARD}, or close a loop",
-    "control_charge": (
-        "Give the amplifier the current that the larger capacitance takes, or drive the charge"
-    ),
-    "avoid_resonance": (
-        "Keep the drive below that frequency (longer edges, a notch filter), or stiffen or damp"
-        " what rings"
-    ),
-    "undo_load_curve": (
-        "Find what the output works against (guide, disc spring, contact) and make it linear, or"
-        f" {_FEED_FORWARD}"
-    ),
-    "preload": (
-        "Preload or clamp the joint so that it keeps its contact, or stay on one side of where it"
-        " is lost"
-    ),
-    "cool": f"Drive slower or less far, let it rest between fast runs, cool it, or {_FEED_FORWARD}",
-    "identify_again": "Identify the gain again from time to time, or close a loop",
-    "more_current": "Use longer edges, or an amplifier that delivers more current",
-    "stay_below_level": "Stay below the level, or use an amplifier that puts out more voltage",
-    "better_drive": "Drive slower, use an amplifier with more bandwidth, or let the model lead",
-    "measure_voltage": (
-        "Record the voltage at the stack in the place of the command, calibrate the amplifier, or"
-        f" {_FEED_FORWARD}"
-    ),
-    "hold_charge": (
-        "Give the charge drive a longer time constant, control the voltage in slow motion, or close"
-        " a loop"
-    ),
-    "align_clocks": (
-        "Shift the reading's time by the delay, or sample both channels by one clock; in a loop the"
-        " delay costs phase"
-    ),
-    "faster_sensor": "Give the sensor more bandwidth, or take the lag off the reading",
-    "calibrate_sensor": "Calibrate the sensor against a better one, and correct its reading",
-    "zero_again": "Let the sensor warm up, and take its zero before and after every run",
-    "shield": (
-        "Shield and ground the sensor's cable, average over whole periods, or filter that frequency"
-    ),
-    "steady_surroundings": (
-        "Keep the temperature steady, start when the set-up has warmed up, or record the"
-        " temperature and correct by it"
-    ),
-    # any model but a stack
-    "lag": "Drive slower, use a faster device there, or keep the lag in the model",
-    "delay": "Shift the time of that signal, sample by one clock, or keep the delay in the model",
-    "bend": "Calibrate that signal and correct it by the curve, or keep the curve in the model",
-    "saturation": "Stay below the level, or use a device there that reaches further",
-    "dead_zone": "Jump over the zone when the sign changes, or make up the play or the threshold",
-    "gain": "Calibrate that signal, check its unit, or keep the gain in the model",
-    "backlash": "Preload what plays, approach from one side, or keep the backlash in the model",
-    "zero": "Take the zero before every run",
-    "drift": "Let the sensor warm up, and take its zero before and after every run",
-    "constant": "Look for a weight, a leak or the offset of an input, and put it into the equation",
-    "loss": "Put the further loss into the equation, or look for what rubs, leaks or cools",
-    "friction": "Lubricate or preload what rubs, overcome it by the input, or keep it in the model",
-    "drag": "Put the quadratic loss into the equation",
-    "curve": "Put the law into the equation in the place of a constant stiffness or conductance",
-    "change": "Put the dependence into the equation in the place of a constant",
-    "stop": "Stay clear of the stop, or keep it in the model",
-    "hysteresis": "Approach from the same side, correct by the extended model, or close a loop",
-}
-
-#: The record that shows an effect, by the test that measures it.
-RECORDS: Mapping[str, str] = {
-    "hold": "a step to the highest voltage, held for ten minutes",
-    "reversal": "slow loops of three amplitudes, nested",
-    "range": "slow loops over the whole range, again with another load or sensor",
-    "slew": "the same loop at three rates, the fastest in use among them",
-    "resonance": "a sweep or a multisine that passes the resonance, well sampled",
-    "record": "a long record with rests, and with the temperature beside it",
-}
-
+#: What can be done by the codes of remedies, and the record that shows an effect by its test.
+DO: Mapping[str, str] = TABLES["remedy"]
+RECORDS: Mapping[str, str] = TABLES["showing_record"]
 
 #: Returns the scale of a length [m].
 Length = Callable[[float], Scale]
@@ -128,31 +48,14 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
         return ""
     first, scale = sizes[0], length(max(abs(s.value) for s in sizes))  # one unit in a sentence
     low, high = first.voltages or (0.0, 0.0)
-    voltages = f"{low:.3g} to {high:.3g} V"
     each = [_amount(s, scale) for s in sizes]
+    values: dict[str, Any] = {}
     if first.test == "hold":
-        way = "falls back" if first.value < 0 else "goes on"
         times = [f"{s.at:g} s" if s.at < 60.0 else f"{s.at / 60.0:g} min" for s in sizes]
-        by = listing([f"{text} in {time}" for text, time in zip(each, times, strict=True)])
-        text = f"after a step to {high:.3g} V the displacement {way} by {by}"
-        if beyond := [time for s, time in zip(sizes, times, strict=True) if s.beyond_records]:
-            verb = "lies" if len(beyond) == 1 else "lie"
-            text += f"; {listing(beyond)} {verb} beyond these records"
-    elif first.test == "reversal":
-        text = f"in loops of {voltages} it sets the ways up and down apart by up to {each[0]}"
-    elif first.test == "range":
-        way = "adds" if sizes[1].value > 0 else "takes"
-        text = (
-            f"over {voltages} it {way} {each[1]} at the top, and bends the curve by"
-            f" up to {each[0]} beside zero and sensitivity"
-        )
-    elif first.test == "slew":
-        rate = prefixed_scale(first.at, "V").text(first.at)
-        text = f"at the fastest slew, {rate}/s, it amounts to {each[0]}"
-    elif first.test == "resonance":
-        where = listing([number(s.at) for s in sizes])
-        text = f"at {where} Hz it makes the displacement {listing(each)} times as large"
-    else:
+        by = [f"{text} in {time}" for text, time in zip(each, times, strict=True)]
+        beyond = [time for s, time in zip(sizes, times, strict=True) if s.beyond_records]
+        values = {"by": by, "beyond": beyond}
+    elif first.test == "record":
         amounts = {(s.test, s.output): amount for s, amount in zip(sizes, each, strict=True)}
         still = {s.output for s in sizes if s.value == 0.0} if len(sizes) > 1 else set()
         moves = [
@@ -160,9 +63,8 @@ def size_text(sizes: Sequence[Size], length: Length) -> str:
             for (test, o), a in amounts.items()
             if test == "record" and o not in still
         ]
-        rms = "".join(f", {a} rms" for (test, _), a in amounts.items() if test == "rms")
-        text = f"within a record of {number(first.at)} s it moves {listing(moves)}{rms}"
-    return text
+        values = {"moves": moves, "rms": [a for (test, _), a in amounts.items() if test == "rms"]}
+    return say(f"size.{first.test}", sizes=sizes, each=each, low=low, high=high, **values)
 
 
 def _amount(size: Size, length: Scale) -> str:
@@ -194,36 +96,20 @@ class Advice:
 def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
     """Return what to do after a diagnosis; `model_file` is where its model was written."""
     if d.verdict == "not_driven":
-        return Advice((
-            "See that both columns are of one run and of one axis, that the amplifier was on, and"
-            " that units and sign are right.",
-        ))  # fmt: skip
-    stack = d if isinstance(d, StackDiagnosis) else None
+        return Advice((say("now.not_driven"),))
+    stack = isinstance(d, StackDiagnosis)
     errors, noise = _sizes(d)
     commands, remarks = _commands(d, model_file)
     if d.verdict == "adequate" and d.doubt:
-        text = "Use the model within these records only: their held-out samples cannot confirm it."
-        return Advice((text,), remarks, commands[:1])
+        return Advice((say("now.unconfirmed"),), remarks, commands[:1])
     if d.verdict == "adequate":
-        text = (
-            f"Use the model: it errs by {errors} on held-out samples, at a noise of"
-            f" {noise}. Other {'voltages' if stack else 'inputs'}, rates and durations than these"
-            " are untested."
-        )
+        text = say("now.adequate", errors=errors, noise=noise, stack=stack)
         return Advice((text,), remarks, commands)
     if not d.causes:
-        text = (
-            f"Do not correct the device by a name: none is certain. Take {errors} as the model's"
-            f" error, and {'measure the next record' if stack else _further(d)}."
-        )
         if d.patch is not None and d.budget.unnamed is not None:
-            patched = (
-                "To predict without a name, --patch patched.json writes the model with the unnamed"
-                f" correction, which removes {percent(within(d.budget.unnamed.share))} of the error"
-                " above the noise."
-            )
-            remarks = (patched, *remarks)
-        return Advice((text,), remarks, commands)
+            share = percent(within(d.budget.unnamed.share))
+            remarks = (say("now.patched", share=share), *remarks)
+        return Advice((say("now.no_cause", errors=errors, stack=stack, d=d),), remarks, commands)
     if d.verdict == "partly_explained" and isinstance(d.budget, StackBudget):
         left = scale_of(d.experiments, d.budget.remains_rms_m).text(d.budget.remains_rms_m)
         remarks = (f"Without an explanation stays {left} rms above the noise.", *remarks)
@@ -241,14 +127,6 @@ def _sizes(d: Diagnosis) -> tuple[str, str]:
     rows = [(e.extended, e.noise, e.unit, f" of {e.output}" * of) for e in d.errors]
     errors = [f"{with_its_unit(error, unit)} rms{name}" for error, _, unit, name in rows]
     return listing(errors), listing([with_its_unit(noise, unit) for _, noise, unit, _ in rows])
-
-
-def _further(d: Diagnosis) -> str:
-    """Return what to do where no effect of any model explains what is missing."""
-    if d.correction is None:
-        return "record more of what may matter: another input, level or output"
-    law = d.correction.equation or f"the law of {d.correction.of} in {d.correction.port}"
-    return f"write {law} into the equations, with its parameters free, and diagnose again"
 
 
 def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -281,10 +159,7 @@ def _commands(d: Diagnosis, model_file: str | None) -> tuple[tuple[str, ...], tu
         names = listing([plain(c.effect) for c in outside])
         remarks.append(f"An exported plant leaves out {names}: correct the reading instead.")
     if model_file is None:
-        remarks.append(
-            f"The commands read {file}: write it with -o {file}, in Python with"
-            f' psa.save_model(result.model, "{file}").'
-        )
+        remarks.append(say("now.unwritten", file=file))
     return tuple(commands), tuple(remarks)
 
 
@@ -304,13 +179,10 @@ def _rivals(causes: Sequence[Cause]) -> list[str]:
         if each:
             cause_effect = [EFFECTS[cause.effect]] if cause.effect in EFFECTS else []
             tests = dict.fromkeys(e.what_now.test for e in (*cause_effect, *known))
-            text = listing([RECORDS[t] for t in tests])
-            lines.append(
-                f"The record does not decide; in the place of {plain(cause.effect)} it may be"
-                f" {'; or '.join(each)}. What decides: {text}."
-            )
+            decides = listing([RECORDS[t] for t in tests])
+            lines.append(say("now.open", effect=cause.effect, each=each, decides=decides))
         elif cause.cannot_be_told_from:
-            lines.append("The records do not decide: record another level, rate or output as well.")
+            lines.append(say("now.open_place"))
     return list(dict.fromkeys(lines))
 
 

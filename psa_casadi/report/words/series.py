@@ -9,11 +9,11 @@ import numpy.typing as npt
 
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.result import Candidate, Diagnosis, StackDiagnosis
-from psa_casadi.identification.determinacy import NORMAL_95
 from psa_casadi.identification.experiments import varied
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
+from psa_casadi.model.variables import NORMAL_95
 from psa_casadi.records.noise import high_frequency_noise
 from psa_casadi.records.split import Experiment, noise_share
 from psa_casadi.report.words import colours, phrases
@@ -149,13 +149,13 @@ def series_of_fit(identification: Identification) -> tuple[Series, ...]:
     """
     rows: list[Series] = []
     if isinstance(identification, StackIdentification):
-        predictions = identification.fit.predicted(identification.experiments)
+        predictions = identification.fit.predicted()
         rows_of = zip(identification.experiments, predictions, strict=True)
         for k, (e, predicted) in enumerate(rows_of):
             noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
             rows.append(_displacement(k, e, [Curve("model", colours.EXTENDED, predicted)], noise))
         return tuple(rows)
-    outputs = identification.fit.outputs(identification.experiments)
+    outputs = identification.fit.outputs()
     for j, channel in enumerate(identification.experiments[0].channels):
         place = identification.model.output_names.index(channel.column)
         for k, y in enumerate(outputs):

@@ -16,6 +16,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.stacks import Stack, stack_model
 from psa_casadi.records.split import Experiment
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.phrases import (
     Scale,
     added,
@@ -27,7 +28,6 @@ from psa_casadi.report.words.phrases import (
     plain,
     prefixed_scale,
     probability_text,
-    share_text,
     with_unit,
 )
 from psa_casadi.report.words.series import ResidualFigures, Series
@@ -135,7 +135,13 @@ def _status(model: Model, name: str, identification: Identification | None) -> s
 def candidate_table(d: Diagnosis) -> Table:
     """Return every effect tried: evidence, share of the excess, and probability if one is named."""
     head = ["effect", "evidence over the base [ln]", "explains of the excess, alone"]
-    rows = [[plain(c.effect), number(round(c.evidence, 6)), share_text(c, d)] for c in d.candidates]
+    named = {c.effect for c in d.causes} if len(d.causes) > 1 else set()
+    shares = {c.what: c for c in d.budget.causes if c.what in named}
+    rows = [
+        [plain(c.effect), number(round(c.evidence, 6)),
+         say("verdict.share", c=c, others=shares.get(c.effect))]
+        for c in d.candidates
+    ]  # fmt: skip
     if added(d):
         head.append("probability" if len(d.causes) < 2 else "probability as the first cause")
         for row, c in zip(rows, d.candidates, strict=True):

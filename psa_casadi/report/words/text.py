@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psa_casadi.common.errors import InputError
-from psa_casadi.diagnosis.held_out import Errors
+from psa_casadi.common.notes import Note
+from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.remedy import Size
-from psa_casadi.diagnosis.result import Cause, Diagnosis, OutputError, StackDiagnosis
+from psa_casadi.diagnosis.result import Cause, Diagnosis, StackDiagnosis
 from psa_casadi.export.check.rows import OF_BINARIES
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
@@ -17,11 +18,10 @@ from psa_casadi.posterior.sample import Posterior
 from psa_casadi.records.signals import in_parts
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.words import verdict_words
-from psa_casadi.report.words.misfit_words import strongest
+from psa_casadi.report.words.catalogue import say
 from psa_casadi.report.words.notes import brief_text
 from psa_casadi.report.words.phrases import (
     MOST_NAMES,
-    Scale,
     added,
     in_display_unit,
     labelled,
@@ -30,11 +30,9 @@ from psa_casadi.report.words.phrases import (
     percent,
     place_of,
     plain,
-    prefixed_scale,
     probability_text,
     rest_sentence,
     scale_of,
-    with_its_unit,
 )
 from psa_casadi.report.words.remedy_words import effect_advice, effect_size, what_now
 from psa_casadi.report.words.tables import Table, blindest, effect_parameter_table, parameter_table
@@ -77,7 +75,11 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     wrong = strongest(stack.misfit) if stack else None
     lines += [("wrong", brief_text(wrong))] if wrong else []
     lines.append(("records", _records_text(d.experiments, origin)))
-    lines += _displacement_errors(stack) if stack else [("error", _missed(e, d)) for e in d.errors]
+    lines += (
+        _displacement_errors(stack)
+        if stack
+        else [("error", say("fit.output_held_out", e=e, added=added(d))) for e in d.errors]
+    )
     for c in d.causes:
         sure = f"{place_of(c)}, {percent(c.confidence)}"
         lines.append(("cause", f"{plain(c.effect)} ({sure}): {verdict_words.cause_size(d, c)}"))
@@ -104,18 +106,24 @@ def _lines(d: Diagnosis, origin: str) -> list[tuple[str, str]]:
     return lines
 
 
+def weight(m: Misfit) -> float:
+    """Return the excess over the noise, by which records are compared."""
+    return m.excess * (m.rms / m.floor.level if m.floor.level > 0 else 1.0)
+
+
+def strongest(misfits: Sequence[Misfit]) -> Note | None:
+    """Return the finding with the largest excess, None if nothing is above the noise."""
+    above_noise = [m for m in misfits if len(m.findings) > 1]
+    return max(above_noise, key=weight).findings[1] if above_noise else None
+
+
 def _displacement_errors(d: StackDiagnosis) -> list[tuple[str, str]]:
     scale = scale_of(d.experiments, d.base_errors.holdout_rms_m)
     sources = listing(list(dict.fromkeys(n.source for n in d.noise)))
     noise = f"{scale.text(d.noise_floor_rms_m)} rms{f', from {sources}' if sources else ''}"
-    lines = [("noise", noise), ("base", _errors(d.base_errors, scale))]
-    return [*lines, *([("extended", _errors(d.extended_errors, scale))] if added(d) else [])]
-
-
-def _missed(e: OutputError, d: Diagnosis) -> str:
-    base, extended, noise = (with_its_unit(v, e.unit) for v in (e.base, e.extended, e.noise))
-    after = f", {extended} of the extended model" if added(d) else ""
-    return f"{e.output}: held-out rms {base} of the base{after}; noise {noise}"
+    rows = [("base", d.base_errors), ("extended", d.extended_errors)][: 1 + added(d)]
+    errors = [(name, say("fit.held_out", e=e, scale=scale)) for name, e in rows]
+    return [("noise", noise), *errors]
 
 
 def _rivals(d: Diagnosis, cause: Cause) -> str:
@@ -160,13 +168,8 @@ def identification_text(
 
 def fit_sentence(identification: Identification) -> str:
     """Say how far a model is from its records."""
-    parts = []
-    for name, rms in identification.rms.items():
-        unit = next(o.unit for o in identification.model.structure.outputs if o.name == name) or "1"
-        noise = identification.noise[name]
-        ratio = f" ({number(rms / noise, 2)} times its noise)" if noise > 0 else ""
-        parts.append(f"{name} by {prefixed_scale(rms, unit).text(rms)}{ratio}")
-    return f"The model misses {listing(parts)} rms."
+    units = {o.name: o.unit or "1" for o in identification.model.structure.outputs}
+    return say("fit.outputs", i=identification, units=units)
 
 
 def effect_page(
@@ -190,18 +193,10 @@ def effect_page(
 
 def check_sentence(report: "CheckReport") -> str:
     """Say how the check of an FMU ended."""
-    against = "" if report.compared else " There was no model to compare it with."
-    if report.foreign:
-        against = " It was checked by the standard; a note is no violation."
     unseen = [name for name in report.left_out if name in OF_BINARIES]
-    if fixed := [name for name in report.left_out if name not in OF_BINARIES]:
-        against += f" Left out, as its step is fixed: {listing(fixed)}."
-    if unseen:
-        against += f" Left out, as lief is not installed (`pip install lief`): {listing(unseen)}."
-    if report.passed:
-        return f"{Path(report.path).name} passed all {len(report.rows)} checks.{against}"
-    failed = listing([r.name for r in report.failures])
-    return f"{Path(report.path).name} did not pass: {failed}.{against}"
+    fixed = [name for name in report.left_out if name not in OF_BINARIES]
+    name = Path(report.path).name
+    return say("check.ended", report=report, name=name, fixed=fixed, unseen=unseen)
 
 
 def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
@@ -214,15 +209,6 @@ def _records_text(experiments: Sequence[Experiment], origin: str) -> str:
         size = f"{cut}{sum(r.n for r in records)} samples in {number(lasts)} s{rest}"
         parts.append(f"{name} ({origin}: {size})")
     return "; ".join(parts)
-
-
-def _errors(e: Errors, scale: Scale) -> str:
-    return (
-        f"held-out error {scale.text(e.holdout_rms_m)} rms"
-        f" ({number(e.holdout_nrmse_percent, 2)} % of range),"
-        f" at most {scale.text(e.holdout_max_m)};"
-        f" training {scale.text(e.train_rms_m)} rms"
-    )
 
 
 def posterior_table(posterior: Posterior) -> Table:
@@ -241,9 +227,7 @@ def posterior_table(posterior: Posterior) -> Table:
 
 def drawn(posterior: Posterior) -> str:
     """Return how much was drawn."""
-    return (
-        f"{posterior.chains} chains of {posterior.draws} draws, {posterior.divergences} divergent"
-    )
+    return say("fit.drawn", p=posterior)
 
 
 def left_table(posterior: Posterior) -> Table:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,7 @@ from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.stepper import doubles, unit_columns, which_of
-from psa_casadi.simulation.timings import count_run, count_steps
+from psa_casadi.simulation.timings import count_run
 
 #: A sample is halved this many times at most; what then misses the tolerance is counted as forced.
 FINEST = 12
@@ -192,28 +192,41 @@ def run_exact(
     return ExactSteps(arrays["shown"], arrays["dy"], x, y, *cost)
 
 
-def run_sets(
-    structure: Structure,
-    t: FloatArray,
-    u: FloatArray,
-    *,
-    p: FloatArray,
-    x0: FloatArray,
-    nominal: FloatArray,
-    tolerance: float,
-    hold: str = "linear",
-    output: str = "measured_displacement",
-) -> FloatArray:
-    """Return the output (n, m) of at most `LANES` sets of parameters p (np, m), run side by side.
+@dataclass(frozen=True)
+class Task:
+    """A model's output under inputs `u` (n, nu) at times `t` (n,) [s], compared with `meant` (n,).
 
-    `x0` and `nominal` are (nx, m). Every column has the bits of a run by itself; one that cannot be
-    integrated is nan from there on. Raises NotExact like `run_exact`.
+    It is run for many sets of parameters. `tolerance` bounds the error of a step over the states'
+    nominal sizes.
     """
-    values = np.empty((len(t), p.shape[1]))
-    arrays = {"p": doubles(p), "x0": doubles(x0), "nominal": doubles(nominal), "shown": values}
+
+    structure: Structure
+    output: str
+    t: FloatArray
+    u: FloatArray
+    meant: FloatArray
+    tolerance: float
+
+
+class Numbers(NamedTuple):
+    """Parameters p (np, m), initial states and nominal sizes (nx, m) of m sets."""
+
+    p: FloatArray
+    x0: FloatArray
+    nominal: FloatArray
+
+
+def run_sets(task: Task, numbers: Numbers) -> FloatArray:
+    """Return the output (n, m) of at most `LANES` sets of parameters, run side by side.
+
+    Every column has the bits of a run by itself; one that cannot be integrated is nan from there
+    on. Raises NotExact like `run_exact`.
+    """
+    values = np.empty((len(task.t), numbers.p.shape[1]))
+    arrays = {**{n: doubles(a) for n, a in numbers._asdict().items()}, "shown": values}
     _run(
-        structure, (output,), (t, u, hold), arrays, lanes=LANES, sets=p.shape[1],
-        tolerance=tolerance, steps_limit=MOST_IN_LANES * len(t),
+        task.structure, (task.output,), (task.t, task.u, "linear"), arrays, lanes=LANES,
+        sets=values.shape[1], tolerance=task.tolerance, steps_limit=MOST_IN_LANES * len(task.t),
     )  # fmt: skip
     return values
 
@@ -235,7 +248,6 @@ def _run(
     if reason:
         raise NotExact(reason)
     t, u, hold = record
-    count_run(differentiated=count > 0)
     lengths, which_step = time_steps(t)
     times = {"t": doubles(t), "v": doubles(u), "length": lengths}
     table: dict[str, npt.NDArray[Any]] = {**times, "which_step": which_step, **arrays}
@@ -245,7 +257,8 @@ def _run(
         **{name: array.ctypes.data for name, array in table.items()},
     )  # fmt: skip
     status = _library(structure, outputs, lanes).psa_run_exact(ctypes.byref(request))
-    count_steps((request.steps + request.rejected) * (1 + count))
+    steps = (request.steps + request.rejected) * (1 + count)
+    count_run(steps, differentiated=count > 0)
     if status == _STOPPED:
         raise KeyboardInterrupt
     if status:

@@ -20,8 +20,8 @@ import fmpy
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.export.fmu.archive import export_fmu
 from psa_casadi.export.fmu.platforms import PLATFORMS, RUNTIME, Platform, runtime, windows_alone
 from psa_casadi.export.fmu.sources import STRICT
 from psa_casadi.simulation.compiler import OPTIMISE, run_compiler, zig_command
@@ -72,7 +72,7 @@ def _missing(what: str, names: Sequence[str]) -> NoReturn:
 def everywhere(fmi: int) -> Path:
     """Return the folder of an unpacked FMU of a stack with binaries for all platforms."""
     path = Path(_FOLDER.name) / f"fmi{fmi}.fmu"
-    export_fmu(model_named(STACK), path, platforms=["all"], fmi=fmi)
+    psa.export_fmu(model_named(STACK), path, platforms=["all"], fmi=fmi)
     folder = path.with_suffix("")
     with zipfile.ZipFile(path) as archive:
         archive.extractall(folder)

@@ -17,7 +17,7 @@ import numpy as np
 from psa_casadi.common.errors import PsaError
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE
 from psa_casadi.export.importer.imported import digest_of
-from psa_casadi.export.importer.play import Run, play
+from psa_casadi.export.importer.masters import Run, Signals, play
 from tests.export.test_foreign_check import faulty
 from tests.studies.benchmarks.table import Outcome, Progress, Row, TitledTable
 
@@ -113,10 +113,8 @@ def _fmpy(path: Path, **words: Any) -> None:
 
 def _ours(path: Path, interface: int) -> None:
     times = np.linspace(0.0, _END, 4)
-    wanted = Run(
-        str(path), digest_of(path), interface, ("u",), ("y",), {}, times, times[:, None], "linear"
-    )
-    result = play(wanted)
+    inputs = Signals(("u",), times, times[:, None])
+    result = play(Run(str(path), digest_of(path), interface, ("y",), {}, inputs))
     if isinstance(result, str):
         raise PsaError(result)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.omnibus import whiteness
+from psa_casadi.diagnosis.noise import whiteness
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from tests.studies.benchmarks.records import Values, clean_set, with_noise
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable, on_all_cores
@@ -89,7 +89,7 @@ def one_run(name: str, seed: int) -> Run:
     level = NOISE * max(r.range_m for r in clean)
     records = with_noise(clean, NOISE, (tuple(psa.STACKS).index(name), seed))
     result = psa.identify(records, stiffness=truth["k_B"])
-    white = tuple(whiteness(r)[0] > _WHITE for r in result.fit.residuals_of(result.experiments))
+    white = tuple(whiteness(r)[0] > _WHITE for r in result.fit.record_residuals)
     return Run(name, compared(result, truth), result.fit.rms / level, white, result.fit.converged)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.held_out import Gain, gain_of
+from psa_casadi.diagnosis.held_out import Compared, Gain
 from psa_casadi.records.split import Experiment, judging
 from tests.studies.benchmarks.hidden_cases import ORDINARY, CaseResult, diagnosed, study
 from tests.studies.benchmarks.records import hidden_record, played_again
@@ -214,4 +214,4 @@ def _play(record: psa.Record, models: Sequence[psa.Model]) -> _Play:
 def _gain(plays: Sequence[_Play]) -> Gain:
     """Return the gain over some further records."""
     experiments, predicted = zip(*plays, strict=True)
-    return gain_of(experiments, *map(list, zip(*predicted, strict=True)))
+    return Compared(experiments, *map(list, zip(*predicted, strict=True))).gain

@@ -37,7 +37,7 @@ def run(progress: Progress, quick: bool) -> Outcome:
     there = {c.name for c in base.model.components}
     table = [e for e in psa.EFFECTS.values() if not e.inputs or record.temperature is not None]
     table = [e for e in table if set(e.needs) <= there]
-    known = best_first(base, Task(experiments, tuple(table), STACK, progress=progress))
+    known = best_first(base, Task(tuple(table), STACK, progress=progress))
     d = psa.diagnose([record], progress=progress)
     rows = [
         {"hypothesis": _named(h), "score": f"{known.scale.score(h):.0f}",

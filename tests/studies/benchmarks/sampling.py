@@ -97,8 +97,8 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
     pm, pt = import_module("pymc"), import_module("pytensor.tensor")
     factor = np.linalg.cholesky(task.covariance)
     with pm.Model():
-        u = pm.Flat("u", shape=len(task.theta), initval=np.zeros(len(task.theta)))
-        theta = pt.as_tensor(task.theta) + pt.dot(pt.as_tensor(factor), u)
+        u = pm.Flat("u", shape=len(task.fit.theta), initval=np.zeros(len(task.fit.theta)))
+        theta = pt.as_tensor(task.fit.theta) + pt.dot(pt.as_tensor(factor), u)
         pm.Potential("density", log_density(task, theta, pm, pt))
         step = pm.NUTS(target_accept=ACCEPT)  # compiles
         began = time.process_time()
@@ -108,7 +108,7 @@ def drawn_by_pymc(task: Task, draws: int, tune: int) -> Drawn:
         )  # fmt: skip
         spent = time.process_time() - began
     moved = result.posterior["u"].to_numpy()[0]
-    return Drawn("PyMC, DifferentialEquation", task.theta + moved @ factor.T, spent)
+    return Drawn("PyMC, DifferentialEquation", task.fit.theta + moved @ factor.T, spent)
 
 
 def log_density(task: Task, theta: Any, pm: Any, pt: Any) -> Any:

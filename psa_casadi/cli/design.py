@@ -1,4 +1,4 @@
-"""`psa design experiment`: the next record to measure, for parameters or to separate effects."""
+"""`psa design experiment`, `input` and `mechanism`: what to measure, to play, to mount."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,10 +7,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Inputs
+from psa_casadi.cli.inputs import Fitting, Inputs, own_model
 from psa_casadi.cli.options import Reading, StackName, names
-from psa_casadi.cli.own_model import Fitting, own_model
-from psa_casadi.cli.screen import show, show_table, show_written, working
+from psa_casadi.cli.screen import show, show_results, show_table, show_written, working
 from psa_casadi.common.errors import InputError
 
 #: Samples of a record by default.
@@ -218,3 +217,174 @@ def _write_page(path: Path, design: Any, model: "psa.Model", still: bool) -> Non
     elif not still:
         live = live_experiment(model, design.record)
     write_experiment_page(path, design, live)
+
+
+def input_(
+    *,
+    output: Path,
+    model: Path | None = None,
+    stack: StackName = None,
+    target: Path | None = None,
+    move: tuple[float, float] | None = None,
+    measured: Path | None = None,
+    minimax: bool = False,
+    fast: bool = False,
+    max_voltage: float | None = None,
+    min_voltage: float | None = None,
+    max_rate: float | None = None,
+    max_current: float | None = None,
+    report: Path | None = None,
+    check_fmu: bool = True,
+    still: bool = False,
+    inputs: Inputs,
+) -> None:
+    """Design the voltage for a path or for a quickest move; test it on simulator and FMU.
+
+    Options:
+        output: CSV to write.
+        target: CSV of the path: time [s], displacement [um].
+        move: Quickest move FROM TO [um] instead.
+        measured: Measured trial of an earlier voltage for this path, to correct it.
+        minimax: Minimise the largest error, not the mean square.
+        fast: Only invert the model and cut at the limits: for long paths.
+        max_voltage: Highest voltage [V].
+        min_voltage: Lowest voltage [V].
+        max_rate: Largest |dv/dt| [V/s].
+        max_current: Largest current [A].
+        report: HTML page to write.
+        check_fmu: Simulate the exported FMU too.
+
+    Example:
+        psa design input --stack P-885.51 --move 2 10 --min-voltage -20
+        --max-voltage 120 -o move.csv
+    """
+    from psa_casadi.cli import design_input_runs as runs
+    from psa_casadi.design.tracking.targets import AmplifierLimits, read_target
+
+    inputs.outputs({"--output": output, "--report": report}, [model, target, measured])
+    if (target is None) == (move is None):
+        inputs.add("Give one of --target PATH.csv and --move FROM TO: the path, or the two ends.")
+    ways = {"--fast": fast, "--minimax": minimax, "--measured": measured is not None}
+    wanted = " and ".join(name for name, chosen in ways.items() if chosen)
+    if sum(ways.values()) > 1:
+        inputs.add(f"{wanted} exclude each other; leave all but one of them out.")
+    if move is not None and target is None and wanted:
+        inputs.add(f"{wanted}: for a path only; leave it out with --move.")
+    numbers = {
+        "min_voltage": min_voltage, "max_voltage": max_voltage,
+        "max_rate": max_rate, "max_current": max_current,
+    }  # fmt: skip
+    named = {name: value for name, value in numbers.items() if value is not None}
+    limits = inputs.attempt(lambda: AmplifierLimits(**named))
+    path = inputs.attempt(lambda: read_target(target)) if target is not None else None
+    trial = inputs.records([measured], Reading()) if measured is not None else []
+    chosen = inputs.model_or_stack(model, stack)
+    plant, limits = inputs.ready(chosen).plant(), inputs.ready(limits)
+    task = runs.Task(plant, limits, output, report, still, check_fmu)
+    if move is not None:
+        runs.move(task, move)
+    elif path is not None and trial:
+        runs.correct(task, path, trial[0])
+    elif path is not None and fast:
+        runs.invert(task, path)
+    elif path is not None:
+        runs.track(task, path, minimax)
+
+
+def mechanism(
+    *,
+    output: Path,
+    model: Path | None = None,
+    stack: StackName = None,
+    damping: float | None = None,
+    bandwidth: float | None = None,
+    poles: str | None = None,
+    max_stroke_loss: str = "10%",
+    max_force: float | None = None,
+    min_mass: float = 0.0,
+    max_mass: float = 1.0,
+    max_damping: float = 1e5,
+    acts_on: Literal["wafers", "tip"] = "wafers",
+    starts: int = 6,
+    port: Path | None = None,
+    report: Path | None = None,
+    still: bool = False,
+    inputs: Inputs,
+) -> None:
+    """Design a prestress mechanism for a wanted damping, bandwidth or poles, within limits.
+
+    MECHANISM.json is a model: `psa export fmu --model MECHANISM.json` makes an FMU of it.
+
+    Options:
+        output: MECHANISM.json to write.
+        damping: Least damping ratio of all mechanical poles.
+        bandwidth: Least bandwidth of the mechanics [Hz].
+        poles: One or two pairs of poles [rad/s]: -4e4+4e4j,-4e4-4e4j
+        max_stroke_loss: Share of the stroke that the stiffness may take.
+        max_force: Largest force in the mechanism in a step of rated voltage [N].
+        min_mass: Least mass [kg].
+        max_mass: Largest mass [kg].
+        max_damping: Largest damping [N.s/m].
+        acts_on: Where it acts: on all of the mechanics as in the paper, or on the output mass.
+        starts: Starts of the search.
+        port: Also write the stack with the port that the mechanism couples to.
+        report: HTML page to write.
+
+    Example:
+        psa design mechanism --stack PTBS200 --damping 0.7 -o mount.json
+    """
+    from psa_casadi.design.mechanism.mechanism import Limits, Wish
+    from psa_casadi.report.page.designs import write_mechanism_page
+    from psa_casadi.report.words.design_words import (
+        mechanism_sentences,
+        mechanism_table,
+        pole_table,
+    )
+
+    inputs.outputs({"--output": output, "--port": port, "--report": report}, [model])
+    chosen = inputs.model_or_stack(model, stack)
+    wanted = inputs.attempt(lambda: _poles(poles))
+    loss = inputs.attempt(lambda: _share(max_stroke_loss))
+    limits = Limits(loss or 0.0, max_force, (min_mass, max_mass), (0.0, max_damping))
+    if wanted is not None:
+        inputs.attempt(lambda: Wish(damping, bandwidth, wanted, limits, starts))
+    chosen, goals = inputs.ready(chosen), inputs.ready(wanted)
+    with working("designing") as progress:
+        progress(f"{starts} starts")
+        design = psa.design_mechanism(
+            chosen, damping=damping, bandwidth=bandwidth, poles=goals, limits=limits,
+            acts_on=acts_on, starts=starts,
+        )  # fmt: skip
+    psa.save_model(psa.mechanism_model(design), output)
+    if port is not None:
+        psa.save_model(psa.port_model(chosen), port)
+    if report is not None:
+        write_mechanism_page(design, report, chosen, still=still)
+    tables = mechanism_table(design), pole_table(design)
+    show_results(mechanism_sentences(design), tables)
+    show_written(output, port, report)
+
+
+def _poles(text: str | None) -> tuple[complex, ...]:
+    """Read poles in rad/s, such as -4e4+4e4j,-4e4-4e4j."""
+    poles = []
+    for part in (text or "").split(","):
+        if not part.strip():
+            continue
+        try:
+            poles.append(complex(part.replace(" ", "").replace("i", "j")))
+        except ValueError as error:
+            raise InputError(
+                f"--poles: '{part.strip()}' is no pole; write -4e4+4e4j,-4e4-4e4j in rad/s."
+            ) from error
+    return tuple(poles)
+
+
+def _share(text: str) -> float:
+    """Read a share: 10% or 0.1."""
+    percent = text.strip().endswith("%")
+    try:
+        value = float(text.strip().removesuffix("%"))
+    except ValueError as error:
+        raise InputError(f"--max-stroke-loss: '{text}' is no share; write 10% or 0.1.") from error
+    return value / 100.0 if percent else value

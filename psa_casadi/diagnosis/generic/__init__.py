@@ -1,1 +1,0 @@
-"""Generic effects of any model: what may be missing at its inputs, outputs and rates."""
