@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import iv
 
 import psa_casadi as psa
 from build_scripts import effects_page
@@ -18,7 +19,7 @@ from build_scripts.page_commands import Block, block_in_tests, blocks_in_tests
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.generic import effects_of, extended
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
-from psa_casadi.examples import several_motors
+from psa_casadi.examples import motor_pack, several_motors
 from psa_casadi.identification.experiments import experiments_of
 from psa_casadi.model.ports import ports_of, with_ports
 from psa_casadi.records.signals import Signals
@@ -97,7 +98,7 @@ def test_a_model_of_one_state_is_diagnosed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_causes_that_cancel_each_other_are_told() -> None:
+def test_causes_that_cancel_each_other_are_reported() -> None:
     """A heater whose capacity grows with its temperature: no effect of the table does that."""
     rng, t = np.random.default_rng(3), 2.0 * np.arange(700)
     power = np.repeat(rng.uniform(0.0, 120.0, 14), 50)
@@ -136,7 +137,7 @@ _HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
 
 @pytest.mark.slow
 @shares_hysteresis
-def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> None:
+def test_the_hysteresis_of_the_benchmark_is_detected_in_the_restoring_force() -> None:
     d = _hysteresis()
     assert _only(d, "hysteresis_of_x_in_v")
     assert d.causes[0].port == "the rate of v"
@@ -154,7 +155,7 @@ def test_the_hysteresis_of_the_benchmark_is_found_in_the_restoring_force() -> No
 
 @pytest.mark.slow
 @shares_hysteresis
-def test_the_page_of_a_diagnosis_tells_the_story(tmp_path: Path) -> None:
+def test_the_page_of_a_diagnosis_shows_the_story(tmp_path: Path) -> None:
     d, path = _hysteresis(), tmp_path / "page.html"
     psa.write_report(d, path)
     text = path.read_text("utf-8")
@@ -244,7 +245,7 @@ def test_an_oscillator_is_sampled_and_compared(
 
 
 @pytest.mark.slow
-def test_dry_friction_of_a_motor_is_found_at_its_shaft(
+def test_dry_friction_of_a_motor_is_detected_at_its_shaft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The program of the page, whose plant has separate equations."""
@@ -379,7 +380,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
     assert len(items) == text.count("\n| `") == 15
 
 
-def test_the_help_of_both_faces_tells_of_own_models() -> None:
+def test_the_help_of_both_faces_mentions_user_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
         assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
         assert str(face.__doc__).count(word) >= 2  # in the signature and in words
@@ -411,3 +412,33 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
             leave_out=["zero_off"],
             starts=1,
         )
+
+
+@pytest.mark.slow
+def test_effects_of_a_pack_are_named_in_plants_of_other_forms(tmp_path: Path) -> None:
+    """The program of the example: each cause hidden once, and one record without any."""
+    table = motor_pack.main(tmp_path)
+    clean = table.pop("nothing")
+    assert clean.verdict == "adequate"
+    assert not clean.causes
+    for hidden, d in table.items():
+        assert [c.effect for c in d.causes] == [hidden]
+        assert d.causes[0].confidence > 0.95
+        assert d.explained_share is not None
+        assert d.explained_share > 0.95
+        for error in d.errors:
+            assert error.extended < 0.65 * error.base or error.extended < 1.1 * error.noise
+    assert table["winding_heat"].verdict == "cause_named"
+
+    pull = table["cogging"].model.values
+    first = 0.012 * np.exp(-0.5) * 2.0 * iv(1, 0.5) / 0.5  # of the plant's Fourier series
+    assert pull["cogging_torque"] == pytest.approx(first, rel=0.1)
+    assert pull["cogging_phase"] == pytest.approx(np.pi - 0.7, abs=0.1)
+    ripple = table["commutation_ripple"].model.values
+    half = np.pi / 10.0
+    assert ripple["k"] == pytest.approx(0.05 * np.sin(half) / half, rel=1e-3)
+    assert 0.0202 < ripple["ripple"] < 0.0249  # the first wave, and half of the swing
+    assert ripple["ripple_phase"] == pytest.approx(np.pi - 1.0, abs=0.05)
+    heat = table["winding_heat"].model.values
+    assert heat["heat_time"] == pytest.approx(15.0, rel=0.1)
+    assert heat["heating"] * heat["R"] == pytest.approx(0.039 * 1.2, rel=0.2)

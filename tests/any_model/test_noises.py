@@ -104,7 +104,7 @@ def test_outliers_in_held_out_samples_are_noise() -> None:
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_a_random_load_is_told_with_its_place_and_size(seed: int) -> None:
+def test_a_random_load_is_reported_with_its_place_and_size(seed: int) -> None:
     rng = np.random.default_rng(seed)
     u = force(rng)
     d = psa.diagnose(mass(), record(u, moved(u + 0.1 * followed(rng, 0.99)), rng))
@@ -117,7 +117,7 @@ def test_a_random_load_is_told_with_its_place_and_size(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_noise_that_is_read_at_an_input_is_told_there() -> None:
+def test_noise_that_is_read_at_an_input_is_reported_there() -> None:
     rng = np.random.default_rng(13)
     u = force(rng)
     read = u + 0.1 * np.std(u) * rng.standard_normal(u.size)
@@ -128,7 +128,7 @@ def test_noise_that_is_read_at_an_input_is_told_there() -> None:
 
 
 @pytest.mark.slow
-def test_friction_is_named_beside_a_random_load() -> None:
+def test_friction_is_named_next_to_a_random_load() -> None:
     rng = np.random.default_rng(14)
     u = force(rng)
     d = psa.diagnose(mass(), record(u, moved(u + 0.05 * followed(rng, 0.99), 0.3), rng))
@@ -136,7 +136,7 @@ def test_friction_is_named_beside_a_random_load() -> None:
 
 
 @pytest.mark.slow
-def test_friction_is_named_beside_outliers_of_one_output() -> None:
+def test_friction_is_named_next_to_outliers_of_one_output() -> None:
     """Samples that are masked in one output count in the others."""
     rng = np.random.default_rng(15)
     u = force(rng)

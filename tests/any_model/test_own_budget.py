@@ -83,7 +83,7 @@ def test_intervals_cover_the_known_shares(records: int) -> None:
         assert low <= _covered(shares, truth) <= high
 
 
-def test_a_share_is_shown_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
+def test_a_share_is_displayed_from_0_to_1_and_without_noise_it_is_that_of_the_power() -> None:
     assert Share("worse", -0.2, (-0.5, 0.1)).clipped == (0.0, 0.0, 0.1)
     assert Share("all", 1.01, (0.9, 1.2)).clipped == (1.0, 0.9, 1.0)
     assert Share("half", 0.5, (0.4, 0.62)).text == "50 % (40 to 62 %)"

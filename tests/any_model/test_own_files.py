@@ -1,8 +1,9 @@
-"""Records of a user's model in files and tables, in other units than the model's."""
+"""Records of a user's model in files and tables: units, noise, held inputs, what is refused."""
 
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from psa_casadi.identification.experiments import column_notes, experiments_of, 
 from psa_casadi.records.read.reading import records_given
 from psa_casadi.records.split import Experiment
 from tests.any_model import own_plants as plants
-from tests.any_model.own_models import cylinder, motor, oscillator
+from tests.any_model.own_models import cylinder, motor, oscillator, oven
 
 N = 400
 T = np.arange(N, dtype=np.float64) * 2e-3
@@ -93,9 +94,9 @@ def _matlab(path: Path) -> Path:
     return path
 
 
-def _run(given: Any) -> Experiment:
+def _run(records: Any) -> Experiment:
     model = _pump()
-    (run,) = experiments_of(model, given_to(model, given, None), judged=False)
+    (run,) = experiments_of(model, given_to(model, records, None), judged=False)
     return run
 
 
@@ -104,8 +105,8 @@ def _columns(run: Experiment, names: Sequence[str]) -> FloatArray:
     return np.column_stack([np.asarray(run.record.column(n)) for n in names])
 
 
-def _assert_is_the_record(given: Any) -> None:
-    run = _run(given)
+def _assert_is_the_record(records: Any) -> None:
+    run = _run(records)
     np.testing.assert_allclose(run.record.time - run.record.time[0], T, atol=1e-12)
     np.testing.assert_allclose(
         _columns(run, _pump().input_names), np.column_stack([VALVE, FLOW]), rtol=1e-12
@@ -185,14 +186,14 @@ def test_a_stacks_record_drives_any_model_and_signals_a_stack() -> None:
     np.testing.assert_allclose(np.asarray(again.displacement), 1e-6 * SPEED, rtol=1e-12)
 
 
-def _refused(given: Any, model: psa.Model | None = None) -> str:
+def _refused(records: Any, model: psa.Model | None = None) -> str:
     with pytest.raises(psa.InputError) as caught:
-        psa.identify(_pump() if model is None else model, given, starts=1)
+        psa.identify(_pump() if model is None else model, records, starts=1)
     return str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (
             ("valve [%]", "valve [kV]"),
@@ -207,14 +208,14 @@ def _refused(given: Any, model: psa.Model | None = None) -> str:
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_what_to_type(
-    change: tuple[str, str], said: str
+    change: tuple[str, str], message: str
 ) -> None:
     before, after = change
     table = {after if name == before else name: values for name, values in COLUMNS.items()}
-    assert re.search(said, _refused(table), re.DOTALL)
+    assert re.search(message, _refused(table), re.DOTALL)
 
 
-def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
+def test_all_mistakes_of_all_records_are_reported_at_once(tmp_path: Path) -> None:
     bad = tmp_path / "bad.csv"
     bad.write_text("time [s],valve,flow,speed\n" + "0,1,2,x\n" * 20)
     statement = _refused([bad, tmp_path / "none.csv", 5, {"time": T, "valve": VALVE}])
@@ -226,7 +227,7 @@ def test_all_mistakes_of_all_records_are_told_at_once(tmp_path: Path) -> None:
     assert "no output of the model 'pump' with eight samples or more; the model's are" in statement
 
 
-def test_a_unit_that_is_not_stated_is_told() -> None:
+def test_a_unit_that_is_not_stated_is_reported() -> None:
     result = psa.identify(motor(), plants.motor(2, friction=0.0), starts=1)
     assert not result.warnings
     record = plants.motor(2, friction=0.0)
@@ -302,7 +303,7 @@ def test_a_clean_record_with_outliers_is_adequate() -> None:
         )
 
 
-def test_identification_and_diagnosis_tell_the_same_noise() -> None:
+def test_identification_and_diagnosis_report_the_same_noise() -> None:
     table = _spoilt(plants.motor(2, friction=0.0), ("w", "i"), 1)
     fitted = psa.identify(motor(), table, starts=1)
     matches = psa.diagnose(motor(), table, leave_out=["hysteresis", "stop", "curve", "delay"])
@@ -321,7 +322,7 @@ def test_identification_and_diagnosis_tell_the_same_noise() -> None:
     assert items[0].startswith("w in record has 30 outliers (at ")
 
 
-def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_told() -> None:
+def test_a_sensor_that_sticks_or_is_saturated_is_masked_and_reported() -> None:
     record = plants.motor(2, friction=0.0)
     y = np.array(record.columns["w"])
     y[700:760] = y[700]
@@ -344,3 +345,86 @@ def test_what_moves_in_jumps_without_noise_is_no_sensor_that_fails() -> None:
     table = {"time": T, "valve": u, "flow": u, "speed": 1.0 * (u > 0.2), "oil_temp": rest}
     run = _run(table)
     assert np.isfinite(_columns(run, _pump().output_names)).all()
+
+
+#: Effects that need no search where nothing is missing: their models would only be compiled.
+_ALL_BUT_LAGS = (
+    "bend", "saturation", "dead_zone", "constant", "loss", "friction", "drag", "curve", "stop",
+    "hysteresis", "zero", "drift",
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_reported() -> None:
+    held = plants.oven(40)
+    few = [n for n in _ALL_BUT_LAGS if n != "zero"]
+    d = psa.diagnose(oven(), held, known_start=True, leave_out=few)
+    assert d.verdict == "cause_named"
+    assert [c.effect for c in d.causes] == ["lag_of_air"]
+    assert d.causes[0].parameters["lag_of_air_time"].value == pytest.approx(25.0, abs=0.5)
+    assert not any("stands still" in n for n in d.notes)
+    other = plants.oven(41)
+    heater = np.where(other.time > 600.0, 1.005, 1.0) * other.columns["heater"]
+    unlike = replace(other, columns={**other.columns, "heater": heater}, hold="linear", sha256="")
+    d = psa.diagnose(oven(), held, holdout=unlike, hold="zero", known_start=True, leave_out=few)
+    assert d.verdict == "partly_explained"
+    assert not d.remaining.white
+    assert "but the held-out ones of" in d.remaining.where
+    lines = replace(held, hold="linear")
+    output = psa.identify(oven(), lines, known_start=True)
+    assert any("'heater' stands still between jumps in oven, and" in w for w in output.warnings)
+    again = psa.identify(oven(), lines, known_start=True, hold="zero")
+    assert not any("stands still" in w for w in again.warnings)
+    assert again.model.values == psa.identify(oven(), held, known_start=True).model.values
+
+
+@pytest.mark.slow
+def test_a_record_without_noise_hides_nothing_and_shows_what_is_hidden() -> None:
+    """A simulation errs by its tolerance, which is no cause; what is rounded is no cause either."""
+    leave_out = ["hysteresis", "stop", "curve", "delay"]
+    clean = plants.motor(2, friction=0.0, noise=0.0)
+    rounded = {n: np.round(y, 3) for n, y in clean.columns.items()}
+    for columns in (clean.columns, {**rounded, "voltage": clean.columns["voltage"]}):
+        d = psa.diagnose(motor(), {"time": clean.time, **columns}, leave_out=leave_out)
+        assert d.verdict == "adequate", d
+    d = psa.diagnose(motor(), plants.motor(1, noise=0.0), leave_out=leave_out)
+    assert d.causes[0].effect == "friction_in_speed"
+    assert d.model.values["friction_in_speed_size"] == pytest.approx(0.012 / 3e-5, rel=0.02)
+
+
+def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
+    record = plants.motor(2, friction=0.0)
+    with pytest.raises(psa.InputError, match=r"`holdout` are those of 'drive', which is fitted"):
+        psa.diagnose(motor(), record, holdout=record)
+    with pytest.raises(psa.InputError, match=r"'known_stat' is not among the arguments for your"):
+        psa.identify(motor(), record, known_stat=True)  # type: ignore[call-overload]
+    with pytest.raises(psa.InputError, match=r"'known_start' is not among the arguments for a st"):
+        psa.identify("record.csv", known_start=True)  # type: ignore[call-overload]
+    with pytest.raises(psa.InputError, match=r"`leave_out` has 'slow_crep', which is no effect"):
+        psa.diagnose("record.csv", leave_out=["slow_crep"])
+    with pytest.raises(psa.InputError, match=r"no effect; of the \d+ there are.* are lag"):
+        psa.diagnose(motor(), record, leave_out=["lagg"], starts=1)
+
+
+def test_columns_in_another_unit_are_reported() -> None:
+    record = plants.motor(2, friction=0.0)
+    columns = {"voltage": record.columns["voltage"], "w": 9.55e3 * record.columns["w"]}
+    result = psa.identify(motor(), {"time": record.time, **columns}, starts=1)
+    assert any("of its own movement: see that its column" in w for w in result.warnings)
+    assert "No record has a column 'i'; that output is not compared." in result.warnings
+
+
+def test_what_an_input_did_in_a_gap_is_not_guessed() -> None:
+    whole = plants.motor(2, friction=0.0)
+    kept = np.r_[0:1200, 1500:3000]
+    columns = {n: values[kept] for n, values in whole.columns.items()}
+    record = replace(whole, time=whole.time[kept], columns=columns, sha256="")
+    result = psa.identify(motor(), record, starts=1)
+    assert [e.record.name for e in result.experiments] == ["drive[0:1200]", "drive[1200:2700]"]
+    assert any(
+        "no sample for 0.301 s from 1.199 s on, while the voltage" in w for w in result.warnings
+    )
+    for name, value in {"R": 1.2, "k": 0.05, "J": 3e-5, "b": 2e-5}.items():
+        assert abs(result.model.values[name] - value) < 4.0 * result.errors[name]
+    held = psa.identify(motor(), replace(record, hold="zero"), starts=1)
+    assert len(held.experiments) == 1

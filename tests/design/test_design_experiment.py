@@ -75,7 +75,7 @@ def planned(kind: Kind, limits: Limits = LIMITS, seed: int = 3) -> psa.Record:
     return psa.Record(name=kind, time=time, voltage=wave.values(wave.start, time))
 
 
-def test_all_that_is_wrong_with_limits_is_said_at_once() -> None:
+def test_all_that_is_wrong_with_limits_is_reported_at_once() -> None:
     with pytest.raises(psa.InputError) as caught:
         Limits(5.0, 5.0, -1.0, 3, rate=0.0)
     assert len(caught.value.problems) == 4
@@ -197,7 +197,7 @@ def test_what_is_known_of_a_rival_holds_it_back() -> None:
     assert tight > 1.05 * loose
 
 
-def test_naming_is_as_sure_as_the_evidence_says() -> None:
+def test_naming_is_as_sure_as_the_evidence() -> None:
     one, other = rivals()
     pair = (one.name, other.name)
     small, large = ({pair: t} for t in (4.0, 60.0))
@@ -207,7 +207,7 @@ def test_naming_is_as_sure_as_the_evidence_says() -> None:
     assert naming_probability(one, [other], large, 4e4) < 0.01
 
 
-def test_coloured_noise_tells_less_of_slow_voltages() -> None:
+def test_coloured_noise_reveals_less_of_slow_voltages() -> None:
     rival = rival_of_model("base", psa.stack_model(STACK), FREE)
     record = planned("triangles")
     errors = []
@@ -286,7 +286,7 @@ def test_the_command_fits_the_rivals_to_the_records_at_hand(tmp_path: Path) -> N
     assert record.voltage.max() <= plan.voltage.max() + 1e-9
 
 
-def test_the_command_tells_all_mistakes_at_once(tmp_path: Path) -> None:
+def test_the_command_reports_all_mistakes_at_once(tmp_path: Path) -> None:
     output = refused(
         "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
         "-o", tmp_path / "no" / "where.csv",
@@ -358,7 +358,7 @@ def test_a_rival_that_is_the_truth_has_a_standard_error_less_of_its_effect(loop:
 
 
 @slow
-def test_the_designed_record_is_like_the_first_and_tells_more_than_a_sine(loop: Loop) -> None:
+def test_the_designed_record_is_like_the_first_and_reveals_more_than_a_sine(loop: Loop) -> None:
     design, first = loop.design, loop.first
     assert design.record.n == first.n
     assert design.record.sample_time == pytest.approx(first.sample_time)
@@ -381,7 +381,7 @@ def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
 
 
 @slow
-def test_the_command_writes_the_record_and_says_so(
+def test_the_command_writes_the_record_and_reports_it(
     loop: Loop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The design itself is the one above: here only what becomes of it."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.design.mechanism.loop import (
     Mounting,
@@ -17,16 +17,7 @@ from psa_casadi.design.mechanism.loop import (
     mechanics_of,
     step_response,
 )
-from psa_casadi.design.mechanism.mechanism import (
-    Limits,
-    MechanismDesign,
-    design_mechanism,
-    mechanism_model,
-    mounted_model,
-    root_locus,
-)
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import stack_model
+from psa_casadi.design.mechanism.mechanism import Limits, MechanismDesign, mounted_model, root_locus
 
 STACK = "PTBS200"
 #: A mechanism of 60 g, 900 N.s/m, 8 N/um: enough to move every pole of the stack.
@@ -56,7 +47,7 @@ def test_a_mounted_stack_is_the_two_equations_with_the_mechanism(
     acts_on: str, mounted: float
 ) -> None:
     design = replace(designed(damping=0.5), mounting=HEAVY, acts_on=acts_on)
-    model = mounted_model(stack_model(STACK), design).with_values({"mounted": mounted})
+    model = mounted_model(psa.stack_model(STACK), design).with_values({"mounted": mounted})
     s = model.structure
     rows = [model.state_names.index(n) for n in ("y", "v_y", "x", "v_x")]
     zero, u = np.zeros(len(s.states)), [i.start for i in s.inputs]
@@ -66,25 +57,25 @@ def test_a_mounted_stack_is_the_two_equations_with_the_mechanism(
 
 
 def test_a_load_on_the_mass_that_the_mechanism_pushes_on_is_refused() -> None:
-    model = stack_model(STACK).with_effect(EFFECTS["load_stiffness"])
+    model = psa.stack_model(STACK).with_effect(psa.EFFECTS["load_stiffness"])
     design = designed(damping=0.5)
     assert "prestress_on_wafers" in [c.name for c in mounted_model(model, design).components]
-    with pytest.raises(InputError, match="push on the same mass"):
+    with pytest.raises(psa.InputError, match="push on the same mass"):
         mounted_model(model, replace(design, acts_on="tip"))
 
 
 @cache
 def designed(**wanted: float) -> MechanismDesign:
     """Return the design for the stack of these tests, within ordinary limits."""
-    return design_mechanism(stack_model(STACK), limits=Limits(0.1), starts=3, **wanted)  # type: ignore[arg-type]
+    return psa.design_mechanism(psa.stack_model(STACK), limits=Limits(0.1), starts=3, **wanted)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("acts_on", ["wafers", "tip"])
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_closed_loop_poles_are_those_of_the_assembled_masses(acts_on: str, share: float) -> None:
-    model = stack_model(STACK)
+    model = psa.stack_model(STACK)
     if share:
-        model = model.with_effect(EFFECTS["reciprocal_coupling"], {"reciprocal_gain": share})
+        model = model.with_effect(psa.EFFECTS["reciprocal_coupling"], {"reciprocal_gain": share})
     spectrum = mechanical_poles(mechanics_of(model, acts_on), HEAVY)
     expected = np.linalg.eigvals(assembled(model.values, HEAVY, acts_on, share))
     order = np.lexsort((expected.imag, np.round(np.abs(expected), 3)))
@@ -93,7 +84,7 @@ def test_closed_loop_poles_are_those_of_the_assembled_masses(acts_on: str, share
 
 
 def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
-    p = stack_model(STACK).values
+    p = psa.stack_model(STACK).values
     A = np.zeros((6, 6))
     A[0, 0] = -1.0 / (p["R_s"] * p["C_p"])
     A[1, :2] = np.array([p["k_L"], -1.0]) / p["tau"]
@@ -104,7 +95,7 @@ def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
     final = -np.linalg.solve(A, B)
     time = np.linspace(0.0, 1e-3, 41)
     states = np.array([final - expm(A * t) @ final for t in time])
-    response = step_response(mechanics_of(stack_model(STACK)), HEAVY, time)
+    response = step_response(mechanics_of(psa.stack_model(STACK)), HEAVY, time)
     assert response.displacement == pytest.approx(states[:, 4], abs=1e-8 * final[4])
     speeds = (A @ states.T).T + B
     force = HEAVY.mass * speeds[:, 5] + HEAVY.damping * states[:, 5]
@@ -113,21 +104,21 @@ def test_step_response_is_the_matrix_exponential_of_the_whole_chain() -> None:
 
 
 def test_bandwidth_is_where_the_response_has_fallen_by_3_db() -> None:
-    p = stack_model(STACK).values
+    p = psa.stack_model(STACK).values
     A = assembled(p, HEAVY, "wafers")
     B, C = np.array([0.0, 1.0 / p["m_P"], 0.0, 0.0]), np.array([0.0, 0.0, 1.0, 0.0])
 
     def size(f: float) -> float:
         return float(abs(C @ np.linalg.solve(2j * np.pi * f * np.eye(4) - A, B)))
 
-    value = bandwidth(mechanics_of(stack_model(STACK)), HEAVY)
+    value = bandwidth(mechanics_of(psa.stack_model(STACK)), HEAVY)
     assert size(value) == pytest.approx(size(0.0) / np.sqrt(2.0), rel=1e-6)
     assert all(size(f) > size(value) for f in np.linspace(0.0, 0.999 * value, 200))
 
 
 def test_wanted_damping_is_reached_within_the_limits() -> None:
     d = designed(damping=0.7)
-    p = stack_model(STACK).values
+    p = psa.stack_model(STACK).values
     poles = np.linalg.eigvals(assembled(p, d.mounting, "wafers"))
     ratio = float((-poles.real / np.abs(poles)).min())
     assert d.attained
@@ -155,8 +146,10 @@ def test_no_neighbour_within_the_limits_is_damped_enough_and_wider() -> None:
     assert beaten == 0
 
 
-def test_force_limit_holds_and_an_unreachable_goal_is_said() -> None:
-    d = design_mechanism(stack_model(STACK), damping=0.7, limits=Limits(force=300.0), starts=1)
+def test_force_limit_holds_and_an_unreachable_goal_is_reported() -> None:
+    d = psa.design_mechanism(
+        psa.stack_model(STACK), damping=0.7, limits=Limits(force=300.0), starts=1
+    )
     time = np.linspace(0.0, 2e-3, 40001)
     peak = float(np.abs(step_response(d.mechanics, d.mounting, time).force).max())
     assert peak <= 300.0
@@ -171,8 +164,10 @@ def test_bandwidth_and_poles_as_goals() -> None:
     assert d.attained
     assert d.reached.bandwidth >= 5000.0 * (1.0 - 1e-3)
     assert d.reached.damping > 5.0 * d.free.damping
-    wanted = mechanical_poles(mechanics_of(stack_model(STACK)), HEAVY)
-    again = design_mechanism(stack_model(STACK), poles=tuple(complex(p) for p in wanted), starts=2)
+    wanted = mechanical_poles(mechanics_of(psa.stack_model(STACK)), HEAVY)
+    again = psa.design_mechanism(
+        psa.stack_model(STACK), poles=tuple(complex(p) for p in wanted), starts=2
+    )
     assert again.attained
     assert again.mounting.mass == pytest.approx(HEAVY.mass, rel=1e-3)
     assert again.mounting.damping == pytest.approx(HEAVY.damping, rel=1e-3)
@@ -186,14 +181,14 @@ def test_root_locus_runs_from_the_free_stack_to_the_design() -> None:
     assert np.sort_complex(branches[-1]) == pytest.approx(np.sort_complex(d.poles), rel=1e-9)
 
 
-def test_bad_wishes_are_all_told_at_once() -> None:
-    with pytest.raises(InputError) as caught:
-        design_mechanism(
-            stack_model(STACK), damping=1.5, poles=(1.0 + 2.0j,),
+def test_bad_wishes_are_all_reported_at_once() -> None:
+    with pytest.raises(psa.InputError) as caught:
+        psa.design_mechanism(
+            psa.stack_model(STACK), damping=1.5, poles=(1.0 + 2.0j,),
             limits=Limits(stroke_loss=1.2, force=-1.0, mass=(2.0, 1.0)),
         )  # fmt: skip
     text = str(caught.value)
     for part in ("damping ratio 1.5", "leave one", "conjugate", "1.2", "-1 N", "mass"):
         assert part in text
-    with pytest.raises(InputError, match="two masses"):
-        design_mechanism(mechanism_model(designed(damping=0.7)), damping=0.7)
+    with pytest.raises(psa.InputError, match="two masses"):
+        psa.design_mechanism(psa.mechanism_model(designed(damping=0.7)), damping=0.7)

@@ -72,7 +72,7 @@ def sharp() -> Informative:
     return informative
 
 
-def test_inputs_keep_their_limits_and_begin_at_their_start_values() -> None:
+def test_inputs_keep_their_limits_and_start_at_their_start_values() -> None:
     record = sharp().record
     assert (record.n, record.units) == (600, {"q": "m3/s", "r": "m3/s"})
     for name, first in (("q", 2e-4), ("r", 0.0)):
@@ -129,7 +129,7 @@ def test_what_does_not_fit_is_named() -> None:
 
 
 @slow
-def test_a_designed_record_tells_two_effects_apart(tmp_path: Path) -> None:
+def test_a_designed_record_distinguishes_two_effects(tmp_path: Path) -> None:
     """The one that is there is named, on a record that was designed with ordinary sizes."""
     psa.save_model(tanks(), tmp_path / "m.json")
     done(
@@ -149,7 +149,7 @@ def test_a_designed_record_tells_two_effects_apart(tmp_path: Path) -> None:
     assert all(math.isfinite(p) for p in result.chance.values())
 
 
-def test_the_command_says_which_input_may_move(tmp_path: Path) -> None:
+def test_the_command_states_which_input_may_move(tmp_path: Path) -> None:
     psa.save_model(tanks(), tmp_path / "m.json")
     words = ("design", "experiment", "--model", tmp_path / "m.json", "--duration", "600")
     assert "add --input NAME=LOW:HIGH, of q, r." in refused(*words)

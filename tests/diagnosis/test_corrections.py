@@ -5,18 +5,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour
 from psa_casadi.diagnosis.corrections import Patch, best_of, corrections, with_patch
 from psa_casadi.diagnosis.held_out import Compared, Removed, held_out_rms
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.records import Record
 from psa_casadi.records.split import Experiment, split
-from psa_casadi.simulation.simulate import simulate
 from tests.tiers import slow_but
 
 TIME: FloatArray = np.linspace(0.0, 4.0, 2001)
@@ -26,18 +22,18 @@ NOISE = 2e-9
 
 
 def _fitted(y: FloatArray) -> tuple[Fit, tuple[Experiment, ...], Colour]:
-    experiments = (split(Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
-    result = fit(compose(BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
+    experiments = (split(psa.Record(name="r", time=TIME, voltage=VOLTAGE, displacement=y)),)
+    result = fit(psa.compose(psa.BASE), experiments, ["k_L", "A", "beta", "gamma"], sigma=[NOISE])
     return result, experiments, Colour((np.zeros(0),), NOISE, (len(result.residuals),))
 
 
-def _held(found: Fit, experiments: tuple[Experiment, ...]) -> float:
-    return held_out_rms(experiments, found.predicted())
+def _held(fit: Fit, experiments: tuple[Experiment, ...]) -> float:
+    return held_out_rms(experiments, fit.predicted())
 
 
 @pytest.fixture(scope="module")
 def clean() -> FloatArray:
-    return simulate(compose(BASE), TIME, VOLTAGE).displacement
+    return psa.simulate(psa.compose(psa.BASE), TIME, VOLTAGE).displacement
 
 
 def _measured(clean: FloatArray, added: FloatArray) -> FloatArray:
@@ -75,7 +71,7 @@ HIDDEN: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)
-def test_what_is_hidden_is_found_at_its_port(hidden: str, clean: FloatArray) -> None:
+def test_what_is_hidden_is_detected_at_its_port(hidden: str, clean: FloatArray) -> None:
     y = _measured(clean, HIDDEN[hidden](clean))
     result, experiments, colour = _fitted(y)
     observed = corrections(result, colour)
@@ -110,12 +106,12 @@ def test_the_patch_is_fitted_as_a_component_and_saved(hidden: str, clean: FloatA
     assert model.without([model.effects[-1].name]).effects == ()
 
 
-def test_resonances_have_no_component_of_their_own(clean: FloatArray) -> None:
+def test_resonances_have_no_separate_component(clean: FloatArray) -> None:
     result, experiments, colour = _fitted(_measured(clean, HIDDEN["memory at the force"](clean)))
     modes = [c for c in corrections(result, colour) if c.kind == "modes"]
     patch = best_of(modes, experiments, [1.0], colour)
     assert isinstance(patch, Patch)
-    with pytest.raises(InputError, match="no form that a model could hold"):
+    with pytest.raises(psa.InputError, match="no form that a model could hold"):
         with_patch(result, patch, result.predicted())
 
 
@@ -136,7 +132,7 @@ def test_shares_of_the_budget_are_of_the_power_above_the_noise() -> None:
     time: FloatArray = np.arange(4000, dtype=float) * 1e-3
     experiments = (
         Experiment(
-            Record(name="r", time=time, voltage=time, displacement=truth + noise), ~held, held
+            psa.Record(name="r", time=time, voltage=time, displacement=truth + noise), ~held, held
         ),
     )
     one, other = (NOISE * s * rng.standard_normal(4000) for s in (3.0, 4.0))

@@ -10,37 +10,29 @@ from scipy.signal import lfilter
 
 import psa_casadi as psa
 from psa_casadi.cli.diagnosis_files import write_patch
-from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import filtered
 from psa_casadi.diagnosis.task import LIMITS
-from psa_casadi.export.importer.fmu_model import load_model
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import write_record
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import split
-from psa_casadi.report.words.text import story
 from psa_casadi.report.words.verdict_words import verdict_sentence
-from psa_casadi.simulation.simulate import simulate
 from tests.contract.helpers import done
 from tests.report.report_cases import diagnosis
 from tests.tiers import slow, slow_but
 
 TIME: FloatArray = np.arange(2000, dtype=float) * 1e-3
 VOLTAGE = 50.0 - 50.0 * np.cos(2 * np.pi * TIME)
-TABLE = [EFFECTS["slow_creep"], EFFECTS["offset_drift"]]
+TABLE = [psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]]
 
 
 @pytest.fixture(scope="module")
 def displacement() -> FloatArray:
     """What a stack does, with a little noise."""
-    result = simulate(stack_model("P-885.51"), TIME, VOLTAGE).displacement
+    result = psa.simulate(psa.stack_model("P-885.51"), TIME, VOLTAGE).displacement
     return result + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
 def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.StackDiagnosis:
-    record = Record(name="r", time=TIME, voltage=voltage, displacement=y)
+    record = psa.Record(name="r", time=TIME, voltage=voltage, displacement=y)
     return psa.diagnose([record], effects=TABLE)
 
 
@@ -56,10 +48,10 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
     assert result.verdict == "not_driven"
     assert not result.causes
     assert "same device" in result.notes[-1]
-    assert "does not follow the voltage" in story(result)
+    assert "does not follow the voltage" in psa.story(result)
 
 
-def test_a_flipped_sign_is_told_with_figures(displacement: FloatArray) -> None:
+def test_a_flipped_sign_is_reported_with_figures(displacement: FloatArray) -> None:
     result = _told(-displacement)
     assert result.verdict == "not_driven"
     assert (
@@ -69,13 +61,13 @@ def test_a_flipped_sign_is_told_with_figures(displacement: FloatArray) -> None:
 
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
-def test_a_displacement_in_another_unit_is_told(factor: float, displacement: FloatArray) -> None:
+def test_another_unit_of_displacement_is_reported(factor: float, displacement: FloatArray) -> None:
     result = _told(factor * displacement)
     assert result.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
 
 
-def _modes() -> Record:
+def _modes() -> psa.Record:
     """Five light modes of either sign behind a delay, sampled too slowly for a stack's modes."""
     time: FloatArray = np.arange(2000) / 500.0
     voltage = 50.0 + 20.0 * np.sin(2 * np.pi * (2.0 * time + 18.5 * time**2))
@@ -86,10 +78,10 @@ def _modes() -> Record:
         y += lfilter([size * (1.0 - abs(pole))], [1.0, -2 * pole.real, abs(pole) ** 2], late)
     y *= 1e-5 / np.std(y)
     y += 1e-7 * np.random.default_rng(3).standard_normal(time.size)
-    return Record(name="r", time=time, voltage=voltage, displacement=y)
+    return psa.Record(name="r", time=time, voltage=voltage, displacement=y)
 
 
-def test_a_linear_filter_of_the_voltage_is_told_from_what_has_nothing_to_do_with_it() -> None:
+def test_a_linear_filter_of_the_voltage_is_distinguished_from_what_is_unrelated() -> None:
     modes = _modes()
     noise = np.random.default_rng(4).standard_normal(modes.n)
     shares = [filtered([split(r)]) for r in (modes, replace(modes, displacement=noise))]
@@ -107,19 +99,19 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
 
 def test_what_no_fit_can_start_from_is_refused_in_words(displacement: FloatArray) -> None:
     rest = np.ones(TIME.size)
-    with pytest.raises(InputError, match="m, more than a stack with any sensor: its unit"):
+    with pytest.raises(psa.InputError, match="m, more than a stack with any sensor: its unit"):
         _told(1e6 * displacement)
-    with pytest.raises(InputError, match="The voltage is 40 V throughout"):
+    with pytest.raises(psa.InputError, match="The voltage is 40 V throughout"):
         _told(displacement, 40.0 * rest)
-    with pytest.raises(InputError, match="The displacement is 1e-06 m throughout: the sensor"):
+    with pytest.raises(psa.InputError, match="The displacement is 1e-06 m throughout: the sensor"):
         _told(1e-6 * rest)
-    with pytest.raises(InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
+    with pytest.raises(psa.InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
         _told(np.where(displacement > np.mean(displacement), 1e-5, 0.0))
 
 
 @slow
-def test_a_record_at_rest_beside_others_counts_over_their_range(displacement: FloatArray) -> None:
-    moves = Record(name="r", time=TIME, voltage=VOLTAGE, displacement=displacement)
+def test_a_record_at_rest_next_to_others_counts_over_their_range(displacement: FloatArray) -> None:
+    moves = psa.Record(name="r", time=TIME, voltage=VOLTAGE, displacement=displacement)
     rest = np.ones(TIME.size)
     hold = replace(
         moves, name="hold", voltage=VOLTAGE[0] * rest, displacement=displacement[0] * rest
@@ -141,14 +133,14 @@ def _curved(displacement: FloatArray) -> FloatArray:
 def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) -> None:
     time = np.arange(2500) * 1e-3
     voltage = 50.0 + 30.0 * np.sin(2 * np.pi * time) + 15.0 * np.sin(2 * np.pi * 0.31 * time)
-    clean = simulate(stack_model("P-885.51"), time, voltage).displacement
+    clean = psa.simulate(psa.stack_model("P-885.51"), time, voltage).displacement
     noise = 5e-9 * np.random.default_rng(2).standard_normal(time.size)
-    write_record(
+    psa.write_record(
         tmp_path / "r.csv",
         {"time [s]": time, "voltage [V]": voltage, "displacement [m]": _curved(clean) + noise},
     )
     paths = {n: tmp_path / n for n in ("ext.json", "patched.json", "d.json", "r.html")}
-    left_out = (word for n in EFFECTS if n not in NEAR for word in ("--leave-out", n))
+    left_out = (word for n in psa.EFFECTS if n not in NEAR for word in ("--leave-out", n))
     statement = done(
         "diagnose", tmp_path / "r.csv", "-o", paths["ext.json"], "--patch", paths["patched.json"],
         "--json", paths["d.json"], "--report", paths["r.html"], "--still", *left_out,
@@ -161,15 +153,15 @@ def test_what_has_no_name_is_offered_with_its_place_and_written(tmp_path: Path) 
     page = paths["r.html"].read_text(encoding="utf-8")
     assert "Where the error goes" in page
     assert "Unnamed correction: curve at the reading" in page
-    patched = load_model(paths["patched.json"])
+    patched = psa.load_model(paths["patched.json"])
     assert [c.name for c in patched.effects] == ["patch_curve_reading"]
-    assert [c.name for c in load_model(paths["ext.json"]).effects] == []
-    moved = simulate(patched, time, voltage)
+    assert [c.name for c in psa.load_model(paths["ext.json"]).effects] == []
+    moved = psa.simulate(patched, time, voltage)
     error = moved.outputs["measured_displacement"] - _curved(clean)
     assert np.std(error) < 0.3 * np.std(_curved(clean) - clean)
 
 
-def test_without_a_correction_nothing_is_written_and_it_says_so(tmp_path: Path) -> None:
+def test_without_a_correction_nothing_is_written_and_that_is_reported(tmp_path: Path) -> None:
     text = write_patch(diagnosis("adequate"), tmp_path / "p.json", lambda _: None)
     assert "No unnamed correction" in text
     assert not (tmp_path / "p.json").exists()

@@ -7,20 +7,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import OwnColour, own_colour
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.diagnosis.held_out import held_out_excess
 from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.diagnosis.task import LIMITS
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records.read.reading import read_record
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import Experiment, divided, split
-from psa_casadi.simulation.simulate import simulate
 from tests.studies.plants.make import make_record, play_again
 from tests.tiers import slow, slow_but
 
@@ -32,9 +26,9 @@ TIME = np.linspace(0.0, 1e-3 * (SAMPLES - 1), SAMPLES)
 def fitted() -> tuple[Fit, FloatArray, FloatArray]:
     """A fit, its voltage [V], and the displacement without noise [m]."""
     voltage: FloatArray = 40.0 * (1.0 - np.cos(2 * np.pi * 4.0 * TIME))
-    model = compose(BASE)
-    clean = simulate(model, TIME, voltage).displacement
-    record = Record(name="r", time=TIME, voltage=voltage, displacement=clean)
+    model = psa.compose(psa.BASE)
+    clean = psa.simulate(model, TIME, voltage).displacement
+    record = psa.Record(name="r", time=TIME, voltage=voltage, displacement=clean)
     return fit(model, (split(record),), ["k_L"], sigma=[LEVEL]), voltage, clean
 
 
@@ -48,7 +42,9 @@ def _own(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnCo
 def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> float:
     """The excess that is reported for an error (n,) [m] of that model."""
     result, voltage, clean = fitted
-    experiments = (split(Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),)
+    experiments = (
+        split(psa.Record(name="r", time=TIME, voltage=voltage, displacement=clean + error)),
+    )
     used = error[experiments[0].used]
     observed = replace(result, experiments=experiments, residuals=used)
     colour = _own(experiments, [error])
@@ -68,11 +64,11 @@ def test_noise_is_no_reason_to_doubt(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
+def test_larger_held_out_errors_are_reported_and_stray_readings_are_not(
     fitted: tuple[Fit, FloatArray, FloatArray], seed: int
 ) -> None:
     _, voltage, clean = fitted
-    held = split(Record(name="r", time=TIME, voltage=voltage, displacement=clean)).held_out
+    held = split(psa.Record(name="r", time=TIME, voltage=voltage, displacement=clean)).held_out
     noise = LEVEL * np.random.default_rng(seed).standard_normal(SAMPLES)
     assert _excess(fitted, np.where(held, 1.3 * noise, noise)) == pytest.approx(1.3, rel=0.12)
     stray = noise.copy()
@@ -82,7 +78,7 @@ def test_larger_held_out_errors_are_told_and_stray_readings_are_not(
 
 @pytest.mark.parametrize("correlation", [0.0, 0.7])
 @pytest.mark.parametrize("samples", [200, 1000, SAMPLES])
-def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
+def test_a_held_out_record_with_different_noise_is_no_reason_to_doubt(
     fitted: tuple[Fit, FloatArray, FloatArray], samples: int, correlation: float
 ) -> None:
     """A tenth of it determines its offset; its noise is three times that of the fitted one."""
@@ -93,7 +89,7 @@ def test_a_held_out_record_with_its_own_noise_is_no_reason_to_doubt(
         draws = LEVEL * rng.standard_normal((2, SAMPLES)) * np.array([[1.0], [3.0]])
         errors = lfilter([1.0], [1.0, -correlation], draws, axis=1)
         records = [
-            Record(name=f"r{k}", time=TIME, voltage=voltage, displacement=clean + e)
+            psa.Record(name=f"r{k}", time=TIME, voltage=voltage, displacement=clean + e)
             for k, e in enumerate(errors)
         ]
         experiments = divided(records[:1], [records[1].slice(0, samples)])
@@ -121,14 +117,16 @@ def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Pat
     play_again(truth, 1, path, (time, slow))
     play_again(truth, 2, tmp_path / "steps.csv", (time, steps))
     play_again(truth, 3, tmp_path / "again.csv", (time, slow))
-    loops, jumps, again = (read_record(tmp_path / f"{n}.csv") for n in ("slow", "steps", "again"))
-    effects = [EFFECTS["current_limit"]]
-    doubted = diagnose([loops], holdout=[jumps], effects=effects)
+    loops, jumps, again = (
+        psa.read_record(tmp_path / f"{n}.csv") for n in ("slow", "steps", "again")
+    )
+    effects = [psa.EFFECTS["current_limit"]]
+    doubted = psa.diagnose([loops], holdout=[jumps], effects=effects)
     assert doubted.verdict == "unexplained"
     assert not doubted.remaining.white
     assert "held-out samples' error is" in doubted.remaining.where
-    assert diagnose([loops], holdout=[again], effects=effects).verdict == "adequate"
-    named = diagnose([loops, jumps], effects=effects)
+    assert psa.diagnose([loops], holdout=[again], effects=effects).verdict == "adequate"
+    named = psa.diagnose([loops, jumps], effects=effects)
     assert [c.effect for c in named.causes] == ["current_limit"]
 
 
@@ -138,15 +136,15 @@ def test_a_named_cause_does_not_hide_that_the_held_out_record_is_another(tmp_pat
     path, shown_again = tmp_path / "creeping.csv", tmp_path / "again.csv"
     truth = make_record("slow_creep", 11, path, visible=(1.0, 2.0))
     play_again(truth, 1, shown_again)
-    record, again = read_record(path), read_record(shown_again)
-    effects = [EFFECTS["slow_creep"]]
-    same = diagnose([record], holdout=[again], effects=effects)
+    record, again = psa.read_record(path), psa.read_record(shown_again)
+    effects = [psa.EFFECTS["slow_creep"]]
+    same = psa.diagnose([record], holdout=[again], effects=effects)
     assert same.verdict == "cause_named"
     assert same.remaining.white
     later = again.time > again.time[0] + 0.15 * again.duration
     gain = np.where(later, 1.005, 1.0)
     scaled = replace(again, displacement=np.asarray(gain * again.displacement, dtype=np.float64))
-    unlike = diagnose([record], holdout=[scaled], effects=effects)
+    unlike = psa.diagnose([record], holdout=[scaled], effects=effects)
     assert unlike.verdict == "partly_explained"
     assert [c.effect for c in unlike.causes] == ["slow_creep"]
     assert "held-out samples' error is" in unlike.remaining.where

@@ -11,10 +11,8 @@ from typing import Any
 
 import pytest
 
+import psa_casadi as psa
 from build_scripts.page_commands import block_in_tests, run_block
-from psa_casadi.diagnosis.diagnose import diagnose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records import read_record
 
 PAGE = Path(__file__).parents[2] / "docs" / "evidence.md"
 
@@ -43,7 +41,7 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
     base, extended, statement = rows()[given]
     assert statement.startswith(f"`{d['verdict']}`")
     named = {n for c in d["causes"] for n in (c["effect"], *c["cannot_be_told_from"])}
-    written = set(re.findall(r"`([a-z_]+)`", statement)) & set(EFFECTS)
+    written = set(re.findall(r"`([a-z_]+)`", statement)) & set(psa.EFFECTS)
     assert written <= named
     if "third effect" not in statement:
         assert {c["effect"] for c in d["causes"]} <= written
@@ -57,8 +55,8 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
 
 @pytest.mark.slow
 def test_the_record_of_the_readme_s_picture_gives_its_row(measured_data: Path) -> None:
-    record = read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
-    content = json.loads(diagnose([record]).to_json())
+    record = psa.read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
+    content = json.loads(psa.diagnose([record]).to_json())
     is_what_the_row_says(content, "`sine_1hz.csv`")
     assert content["budget"]["together"]["share"] > 0.95
 

@@ -58,7 +58,7 @@ def test_every_constant_is_moved() -> None:
     assert moved["price = 16"].thresholds.price == 16.0
 
 
-def test_a_diagnosis_decides_by_the_constants_that_it_is_given() -> None:
+def test_a_diagnosis_decides_by_the_constants_that_are_passed() -> None:
     """With those of every other diagnosis gone: whatever would use them fails."""
     time = np.linspace(0.0, 2.0, 600)
     voltage = 40.0 * (1.0 - np.cos(4 * np.pi * time))
@@ -79,7 +79,7 @@ def test_a_diagnosis_decides_by_the_constants_that_it_is_given() -> None:
     assert not psa.diagnose([record], effects=effects, method=strict).causes
 
 
-def test_a_spent_budget_ends_the_search_and_says_what_was_left() -> None:
+def test_a_spent_budget_ends_the_search_and_states_what_was_left() -> None:
     """The first visit is made; what was done and left is the same on one core and on two."""
     record = psa.read_record(str(resources.files("psa_casadi") / "data" / "demo.csv"))
     items = []

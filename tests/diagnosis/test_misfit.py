@@ -136,7 +136,7 @@ def test_white_noise_shows_nothing(voltage: FloatArray, seed: int) -> None:
     assert m.spectrum.share < 0.02
 
 
-def test_coloured_noise_says_something_false_in_one_of_forty_records_at_most() -> None:
+def test_coloured_noise_misleads_in_one_of_forty_records_at_most() -> None:
     output = 0
     for seed in range(40):
         voltage = (SINE, MULTISINE, STEPS)[seed % 3][:8_000]

@@ -46,7 +46,7 @@ def sound() -> psa.Record:
     return recorded("c07", noise=1)
 
 
-def test_an_effect_is_named_beside_a_hysteresis_that_the_base_lacks() -> None:
+def test_an_effect_is_named_next_to_a_hysteresis_that_the_base_lacks() -> None:
     good, new = recorded("k02", noise=1, sound=True), recorded("k02", noise=2)
     d = psa.diagnose(new, reference=good)
     assert [c.effect for c in d.causes] == ["slow_creep"]
@@ -66,7 +66,7 @@ def test_nothing_has_changed_in_the_same_test_of_a_healthy_device(sound: psa.Rec
     assert notes["since"].values["removed"][0] > 2.0 * d.noise_floor_rms_m
 
 
-def test_a_gain_that_has_changed_is_told_as_a_parameter() -> None:
+def test_a_gain_that_has_changed_is_reported_as_a_parameter() -> None:
     new, good = (recorded("c02", noise=k, gain=g).slice(0, 2000) for k, g in ((3, 0.97), (1, 1.0)))
     d = psa.diagnose(new, reference=good)
     assert d.verdict == "adequate"
@@ -108,7 +108,7 @@ def test_a_voltage_that_the_reference_does_not_show_is_refused(sound: psa.Record
         psa.diagnose(twice, reference=sound)
 
 
-def test_a_model_of_ones_own_takes_no_reference(sound: psa.Record) -> None:
+def test_a_user_model_takes_no_reference(sound: psa.Record) -> None:
     words: Any = {"reference": sound}
     with pytest.raises(psa.InputError, match="'reference' is not among the arguments for"):
         psa.diagnose(oven(), [sound], **words)

@@ -6,17 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.diagnosis.remedy import Size, example, sizes
 from psa_casadi.diagnosis.result import Verdict
-from psa_casadi.model.component import Component
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.effects.mechanics import MODAL_SERIES
 from psa_casadi.model.evidence import Covariance, Evidence, SeenRange
 from psa_casadi.model.variables import Interval
-from psa_casadi.records import Record
-from psa_casadi.report.page.results import write_report
 from psa_casadi.report.words.phrases import handy_scale
 from psa_casadi.report.words.remedy_words import DO, RECORDS, size_text, what_now
 from psa_casadi.report.words.text import effect_page
@@ -29,17 +24,17 @@ PER_VOLT = 1e-7
 LOW, HIGH, RATE = -10.0, 90.0, 2000.0
 
 
-def stack(effect: str, covariance: Covariance | None = None, **values: float) -> Model:
+def stack(effect: str, covariance: Covariance | None = None, **values: float) -> psa.Model:
     """Return a linear stack with an effect, as if identified from 30 s between -10 and 90 V."""
-    model = compose((*BASE, EFFECTS[effect]), {**VALUES, **values})
+    model = psa.compose((*psa.BASE, psa.EFFECTS[effect]), {**VALUES, **values})
     observed = SeenRange(Interval(LOW, HIGH), RATE, 30.0)
     return replace(
         model, evidence=Evidence("test", 0.0, observed, covariance or Covariance((), ()))
     )
 
 
-def of(effect: str, model: Model) -> dict[tuple[str, float], Size]:
-    return {(s.test, s.at): s for s in sizes(EFFECTS[effect], model)}
+def of(effect: str, model: psa.Model) -> dict[tuple[str, float], Size]:
+    return {(s.test, s.at): s for s in sizes(psa.EFFECTS[effect], model)}
 
 
 def test_creep_goes_on_by_the_sum_of_its_relaxations() -> None:
@@ -56,7 +51,7 @@ def test_creep_goes_on_by_the_sum_of_its_relaxations() -> None:
 
 
 def test_play_sets_the_ways_apart_by_the_gap_and_a_delay_moves_by_rate_times_time() -> None:
-    stroke = PER_VOLT * compose(BASE, VALUES).values["u_rated"]
+    stroke = PER_VOLT * psa.compose(psa.BASE, VALUES).values["u_rated"]
     play = of("backlash", stack("backlash", backlash_gain=1.0, backlash_width=0.01))
     assert play["reversal", HIGH].value == pytest.approx(2 * 0.01 * stroke, rel=5e-3)
     late = of("sensor_delay", stack("sensor_delay", sensor_delay=2e-4))  # Pade overshoots at turns
@@ -65,8 +60,8 @@ def test_play_sets_the_ways_apart_by_the_gap_and_a_delay_moves_by_rate_times_tim
     assert late["slew", RATE].value == pytest.approx(2e-4 * RATE * PER_VOLT, rel=1e-3)
 
 
-def test_a_curve_bends_beside_zero_and_sensitivity() -> None:
-    gain, rated = 0.1, compose(BASE, VALUES).values["u_rated"]
+def test_a_curve_bends_next_to_zero_and_sensitivity() -> None:
+    gain, rated = 0.1, psa.compose(psa.BASE, VALUES).values["u_rated"]
     result = of("field_dependent_gain", stack("field_dependent_gain", field_gain=gain))
     u = np.linspace(LOW, HIGH, 2001)
     added = PER_VOLT * gain * u * np.abs(u) / rated
@@ -78,7 +73,7 @@ def test_a_curve_bends_beside_zero_and_sensitivity() -> None:
 def test_a_mode_is_heard_at_its_frequency() -> None:
     frequency, damping, gain = 300.0, 0.02, 0.05
     model = stack("structural_mode", mode_gain=gain, mode_frequency=frequency, mode_damping=damping)
-    (first, *_) = sizes(EFFECTS["structural_mode"], model)
+    (first, *_) = sizes(psa.EFFECTS["structural_mode"], model)
     f = np.linspace(250.0, 350.0, 20001) / frequency
     ratio = np.abs(1.0 + gain / (1.0 - f**2 + 2j * damping * f))
     assert first.value == pytest.approx(np.max(ratio), rel=1e-3)
@@ -87,10 +82,10 @@ def test_a_mode_is_heard_at_its_frequency() -> None:
 
 def test_a_model_without_records_to_play_has_no_size_of_them() -> None:
     model = stack("offset_drift", drift_rate=1e-8)
-    assert sizes(EFFECTS["offset_drift"], model) == ()
+    assert sizes(psa.EFFECTS["offset_drift"], model) == ()
     t = np.linspace(0.0, 5.0, 501)
-    record = Record(name="r", time=t, voltage=10.0 * np.sin(t), displacement=0.0 * t)
-    largest, rms = sizes(EFFECTS["offset_drift"], model, [record])
+    record = psa.Record(name="r", time=t, voltage=10.0 * np.sin(t), displacement=0.0 * t)
+    largest, rms = sizes(psa.EFFECTS["offset_drift"], model, [record])
     assert largest.value == pytest.approx(5e-8, rel=1e-3)
     assert rms.value == pytest.approx(np.std(1e-8 * t), rel=1e-3)
 
@@ -99,15 +94,15 @@ def test_a_size_is_as_certain_as_the_parameters_of_the_effect() -> None:
     gain, error = 0.02, 0.001
     known = Covariance(("creep_gain", "k_L"), ((error**2, 0.0), (0.0, 1.0)))
     model = stack("slow_creep", known, creep_gain=gain, creep_time=0.5)
-    for size in sizes(EFFECTS["slow_creep"], model):
+    for size in sizes(psa.EFFECTS["slow_creep"], model):
         low, high = size.interval or (0.0, 0.0)
         share = 1.959964 * error / gain
         assert low == pytest.approx(size.value * (1 - share), rel=1e-3)
         assert high == pytest.approx(size.value * (1 + share), rel=1e-3)
 
 
-@pytest.mark.parametrize("effect", [*EFFECTS.values(), MODAL_SERIES[2]], ids=lambda e: e.name)
-def test_every_effect_has_a_size_and_a_remedy_in_words(effect: Component) -> None:
+@pytest.mark.parametrize("effect", [*psa.EFFECTS.values(), MODAL_SERIES[2]], ids=lambda e: e.name)
+def test_every_effect_has_a_size_and_a_remedy_in_words(effect: psa.Component) -> None:
     assert effect.remedy is not None
     model, result = example(effect)
     assert result
@@ -120,10 +115,10 @@ def test_every_effect_has_a_size_and_a_remedy_in_words(effect: Component) -> Non
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)
-def test_every_verdict_says_what_now_right_below_itself(tmp_path: Path, verdict: Verdict) -> None:
+def test_every_verdict_is_followed_by_the_next_step(tmp_path: Path, verdict: Verdict) -> None:
     d = diagnosis(verdict)
     advice = what_now(d, "my models/e.json")
-    write_report(d, tmp_path / "r.html", still=True, model_file="my models/e.json")
+    psa.write_report(d, tmp_path / "r.html", still=True, model_file="my models/e.json")
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     top = " ".join(Page(text[: text.index("<h2")]).text.replace("\u00a0", " ").split())
     assert top.index("What now") < top.index("Remains:")

@@ -92,7 +92,7 @@ def test_what_the_package_simulates_is_adequate(case: Case) -> None:
 
 
 @pytest.mark.parametrize("step", [1e-6, 1e-9, 1e-10])
-def test_the_last_place_of_a_file_is_seen(step: float) -> None:
+def test_the_last_place_of_a_file_is_detected(step: float) -> None:
     x = 1e-5 * np.sin(np.linspace(0.0, 20.0, 3000))
     assert last_place_of(step * np.round(x / step)) == pytest.approx(step)
     assert last_place_of(x) == 0.0

@@ -480,7 +480,7 @@ def test_a_clip_makes_flat_tops_at_its_level(level: float) -> None:
 @pytest.mark.parametrize("frequency", [50.0, 300.0, 1500.0])
 @pytest.mark.parametrize("amplitude", [1.0, 30.0])
 @pytest.mark.parametrize("shape", [1e-4, 0.5])
-def test_a_drive_lag_stands_beside_the_base_at_every_amplitude(
+def test_a_drive_lag_joins_the_base_at_every_amplitude(
     frequency: float, amplitude: float, shape: float
 ) -> None:
     """Without hysteresis the response is the base's over 1 + i w T - shape (w T)^2."""

@@ -11,14 +11,11 @@ from scipy.signal import lfilter, lsim
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.common.units import FloatArray
-from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.linear_response import Response, modes_of
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.effects.mechanics import MODAL_SERIES
-from psa_casadi.model.stacks import stack_model
 from psa_casadi.records import multisine
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.tables import parameter_table
 from tests.studies.exam.hysteresis import relay_means
@@ -142,11 +139,11 @@ def test_a_model_with_modes_becomes_an_fmu(tmp_path: Path) -> None:
     assert psa.check_fmu(path, with_two_modes()).passed
 
 
-STACK = stack_model("P-885.51")
+STACK = psa.stack_model("P-885.51")
 C_P = STACK.values["C_p"]
 
 
-def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> Record:
+def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> psa.Record:
     """A record of the independent reference, whose current has a separate noise and zero."""
     rng = np.random.default_rng(3)
     t = step * np.arange(1500.0)
@@ -163,17 +160,17 @@ def _recorded(step: float, tones: tuple[float, ...], *, noise: float = 0.01) -> 
     )
     current = result.current + noise * np.std(result.current) * rng.standard_normal(t.size)
     displayed = result.displacement + 2e-9 * rng.standard_normal(t.size)
-    return Record(
+    return psa.Record(
         name="r", time=t, voltage=voltage, displacement=displayed, current=current + 0.003
     )
 
 
 @pytest.fixture(scope="module")
-def fast() -> Record:
+def fast() -> psa.Record:
     return _recorded(5e-6, (300.0, 1100.0, 2900.0, 7000.0))
 
 
-def test_a_current_determines_the_capacitance(fast: Record) -> None:
+def test_a_current_determines_the_capacitance(fast: psa.Record) -> None:
     capacitance = capacitance_of([fast])
     assert capacitance is not None
     assert capacitance.value == pytest.approx(C_P, abs=4.0 * capacitance.error)
@@ -192,7 +189,7 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
     clean = capacitance * omega * 40.0 * (np.sin(omega * t) - loss * np.cos(omega * t))
     noise = 0.01 * np.std(clean) * np.random.default_rng(2).standard_normal(t.size)
     result = capacitance_of(
-        [Record(name="r", time=t, voltage=voltage, displacement=None, current=clean + noise)]
+        [psa.Record(name="r", time=t, voltage=voltage, displacement=None, current=clean + noise)]
     )
     assert result is not None
     assert result.value == pytest.approx(capacitance, rel=0.01)
@@ -200,7 +197,7 @@ def test_a_slow_current_of_any_size_and_a_lossy_ceramic(capacitance: float) -> N
 
 
 @slow
-def test_a_current_that_is_not_the_stack_s_determines_nothing(fast: Record) -> None:
+def test_a_current_that_is_not_the_stack_s_determines_nothing(fast: psa.Record) -> None:
     noise = np.random.default_rng(1).standard_normal(fast.n)
     assert fast.current is not None
     for current in (noise, np.zeros(fast.n), None, 1e6 * fast.current, -fast.current):
@@ -210,7 +207,7 @@ def test_a_current_that_is_not_the_stack_s_determines_nothing(fast: Record) -> N
 
 
 @slow
-def test_an_identified_model_has_the_measured_capacitance(fast: Record) -> None:
+def test_an_identified_model_has_the_measured_capacitance(fast: psa.Record) -> None:
     """Without the current the capacitance is assumed, and the simulated current as wrong."""
     result = psa.identify([fast.slice(0, 700)])
     assert result.model.values["C_p"] == pytest.approx(C_P, rel=0.01)
@@ -227,7 +224,7 @@ def test_an_identified_model_has_the_measured_capacitance(fast: Record) -> None:
 FINER, LEAK_TIME = 20, 2.5
 
 
-def _leaking(name: str, frequency: float, duration: float, rate: float, seed: int) -> Record:
+def _leaking(name: str, frequency: float, duration: float, rate: float, seed: int) -> psa.Record:
     """A sine of 0 to 100 V behind a high-pass of 2.5 s, on a Bouc-Wen loop; 5 nm of noise."""
     step = 1.0 / (rate * FINER)
     time = np.linspace(0.0, duration, round(duration * rate) * FINER, endpoint=False)
@@ -241,7 +238,7 @@ def _leaking(name: str, frequency: float, duration: float, rate: float, seed: in
         h[k + 1] = h[k] + _rate(middle, dq)
     x = 1e-7 * (q + h)[::FINER]
     noise = 5e-9 * np.random.default_rng(seed).standard_normal(x.size)
-    return Record(name=name, time=time[::FINER], voltage=u[::FINER], displacement=x + noise)
+    return psa.Record(name=name, time=time[::FINER], voltage=u[::FINER], displacement=x + noise)
 
 
 def _rate(h: float, dq: float) -> float:
@@ -249,11 +246,11 @@ def _rate(h: float, dq: float) -> float:
 
 
 @pytest.mark.slow
-def test_it_is_named_alone_and_predicts_a_record_that_no_fit_has_seen() -> None:
+def test_it_is_named_alone_and_predicts_a_record_that_no_fit_has_used() -> None:
     fitted = [_leaking("slow", 0.05, 60.0, 50.0, 1), _leaking("fast", 1.0, 10.0, 500.0, 2)]
     slow = ("charge_leakage", "slow_creep", "ageing", "self_heating", "offset_drift", "drive_lag")
     like = [psa.EFFECTS[n] for n in (*slow, "sensor_lag", "hysteresis_memory")]
-    d = diagnose(fitted, holdout=[_leaking("judged", 20.0, 0.5, 5000.0, 3)], effects=like)
+    d = psa.diagnose(fitted, holdout=[_leaking("judged", 20.0, 0.5, 5000.0, 3)], effects=like)
     assert [c.effect for c in d.causes] == ["charge_leakage"], d
     values = d.causes[0].parameters
     assert values["leak_gain"].value == pytest.approx(1.0, abs=2e-3)

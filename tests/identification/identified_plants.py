@@ -8,44 +8,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import predict_record
-from psa_casadi.identification.identify import StackIdentification, identify
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import compose
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, read_record
 from psa_casadi.records.split import whole
+from tests.model.stack_models import plant_of, stack
 from tests.studies.plants.make import Truth, make_record
-from tests.studies.plants.stack import Stack, loop_width
+from tests.studies.plants.stack import loop_width
 
 
 @cache
-def plant(seed: int) -> tuple[Truth, Record]:
+def plant(seed: int) -> tuple[Truth, psa.Record]:
     """Return a plant without a hidden effect and its record."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "record.csv")
-        return make_record(None, seed, path), read_record(path)
+        return make_record(None, seed, path), psa.read_record(path)
 
 
 @cache
-def identified(seed: int) -> StackIdentification:
-    return identify([plant(seed)[1]])
+def identified(seed: int) -> psa.StackIdentification:
+    return psa.identify([plant(seed)[1]])
 
 
 def noise(truth: Truth) -> float:
     """Return the noise put in [m], with that of rounding to the sensor's count."""
     return float(np.hypot(truth.sigma, truth.quantum / np.sqrt(12.0)))
-
-
-def values_of(s: Stack) -> dict[str, float]:
-    """Return a plant's parameters under the model's names."""
-    return {
-        "R_s": s.r_s, "C_p": s.c_p_el, "k_L": s.k_l, "A": s.a, "beta": s.beta, "gamma": s.gamma,
-        "delta": s.delta, "n": s.n, "h_ref": s.h_ref, "tau": s.tau, "m_P": s.m_p, "c_P": s.c_p,
-        "k_P": s.k_p, "m_B": s.m_b, "c_B": s.c_b, "k_B": s.k_b, "u_rated": s.u_rated,
-    }  # fmt: skip
 
 
 def combinations(p: Mapping[str, float]) -> dict[str, float]:
@@ -57,14 +45,9 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
     """
     compliance = 1 / p["k_P"] + 1 / p["k_B"]
     lag = p["tau"] + p["R_s"] * p["C_p"] + p["c_P"] / p["k_P"] + p["c_B"] / p["k_B"]
-    table = {name: p[name] for name in ("beta", "gamma", "delta", "n", "h_ref", "tau", "u_rated")}
-    stack = Stack(
-        r_s=p["R_s"], c_p_el=p["C_p"], k_l=p["k_L"], a=p["A"], m_p=p["m_P"], c_p=p["c_P"],
-        k_p=p["k_P"], m_b=p["m_B"], c_b=p["c_B"], k_b=p["k_B"], **table,
-    )  # fmt: skip
     return {
         "slope": (p["k_L"] + p["A"]) * compliance,
-        "width": loop_width(stack) * compliance,
+        "width": loop_width(plant_of(p)) * compliance,
         "asymmetry": p["delta"] * compliance,
         "n": p["n"],
         "lag": lag - (p["c_P"] + p["c_B"]) / (p["k_P"] + p["k_B"]),
@@ -75,14 +58,14 @@ def combinations(p: Mapping[str, float]) -> dict[str, float]:
 IDENTIFIED = ("k_L", "A", "beta", "gamma", "n", "tau", "delta", "R_s", "c_P", "c_B")
 
 
-def same_as_the_named_stack(rms: float, record: Record, name: str) -> None:
+def same_as_the_named_stack(rms: float, record: psa.Record, name: str) -> None:
     """The named stack meets its record as well as any values of what was identified for it.
 
     A search from nothing is at least as good. It may be better: it frees masses besides, and in the
     demonstration's record, half as far off, it takes the hidden creep for a lag of the wafers, with
     c_P on its bound, with a warning. Offset and memory are fitted.
     """
-    model = compose(BASE, {k: f.value for k, f in STACKS[name].values.items()})
+    model = stack(name)
     y: FloatArray = np.asarray(record.displacement)
     result = fit(model, [whole(record)], [], sigma=[rms])
     again = fit(model, [whole(record)], IDENTIFIED, sigma=[rms])

@@ -9,16 +9,12 @@ import numpy as np
 from psa_casadi import reference
 from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.identification.start.linear_response import mechanics_poles, numerator_time
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record, sine, time_grid
+from tests.model.stack_models import stack_values
 
 LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0, "R_s": 8e-3}
 #: A loop that leads, for which the paper's condition gamma > beta holds (over k_L).
 LEADING = {"A": 0.25, "beta": 0.05, "gamma": 0.2, "delta": -0.02}
-
-
-def values(name: str, **changes: float) -> dict[str, float]:
-    return {key: figure.value for key, figure in STACKS[name].values.items()} | changes
 
 
 def compliance(p: dict[str, float]) -> float:
@@ -77,7 +73,7 @@ def responding(p: dict[str, float], name: str, time: FloatArray, voltage: FloatA
 @lru_cache(maxsize=8)
 def loop(name: str = "P-885.51", frequency: float = 1.0, leading: bool = False) -> Record:
     """Return two periods of a sine from rest at 0 V to u_rated, without noise."""
-    p = values(name)
+    p = stack_values(name)
     if leading:
         p |= {key: share * p["k_L"] for key, share in LEADING.items()}
     time = time_grid(2.0 / frequency, 1.0 / (500.0 * frequency))
@@ -91,7 +87,7 @@ def real_step(volts: float, name: str = "P-885.51") -> Record:
     time = np.linspace(0.0, 4e-3, 4001)
     voltage = np.full(time.shape, volts)
     voltage[0] = 0.0
-    return responding(values(name), f"step {volts:g} V", time, voltage)
+    return responding(stack_values(name), f"step {volts:g} V", time, voltage)
 
 
 def noisy(record: Record, share: float) -> Record:

@@ -265,7 +265,7 @@ def test_an_odd_record_of_a_sound_stack_is_adequate(
 
 
 @pytest.mark.slow
-def test_a_voltage_with_the_other_sign_is_told(record: Record) -> None:
+def test_a_voltage_with_the_other_sign_is_reported(record: Record) -> None:
     voltage = record.voltage
     result = diagnose([replace(record, voltage=-voltage)], effects=TABLE)
     assert result.verdict == "not_driven"

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import texts
 from psa_casadi.diagnosis.diagnose import decided
 from psa_casadi.identification.fitting.fit import Objective, fit
@@ -21,12 +20,7 @@ from psa_casadi.identification.fitting.prediction import scaled
 from psa_casadi.identification.prepare import COLUMNS, columns_of, with_levels
 from psa_casadi.identification.start.ordinary import capacitance_of, starting_model
 from psa_casadi.model.components.surroundings import flexure
-from psa_casadi.model.compose import compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records.read.reading import read_record
-from psa_casadi.records.record import Record
 from psa_casadi.records.split import split, whole
-from psa_casadi.report.page.results import write_report
 from psa_casadi.simulation.simulate import Way
 from tests.studies.plants import further_columns as plants
 from tests.studies.plants.excitations import ExcitationKind
@@ -49,7 +43,7 @@ def diagnosed(
 ) -> psa.StackDiagnosis:
     truth = hide(plants.plain(seed, excitation), gain)
     record = truth.record(seed, column, samples=SAMPLES)
-    return psa.diagnose([record], effects=[EFFECTS[n] for n in effects])
+    return psa.diagnose([record], effects=[psa.EFFECTS[n] for n in effects])
 
 
 def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path) -> None:
@@ -67,7 +61,7 @@ def test_every_column_is_read_and_its_scale_and_noise_are_fitted(tmp_path: Path)
     np.savetxt(
         path, np.column_stack(columns), delimiter=",", header=header, comments="", fmt="%.9g"
     )
-    read = read_record(path)
+    read = psa.read_record(path)
     for name in COLUMNS:
         np.testing.assert_allclose(getattr(read, name), getattr(r, name), rtol=1e-6, atol=1e-12)
     start = starting_model([read])
@@ -119,7 +113,7 @@ def test_the_derivatives_of_further_columns_are_those_of_their_residuals() -> No
 
 def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_out() -> None:
     time = np.linspace(0.0, 1.0, 50)
-    r = Record(
+    r = psa.Record(
         name="r",
         time=time,
         voltage=10 * time,
@@ -127,8 +121,10 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
         monitor_voltage=time,
         strain=0.0 * time,
     )
-    with pytest.raises(InputError, match="'monitor_voltage', but the model 'psa' does not give it"):
-        columns_of(compose([flexure]), [r])
+    with pytest.raises(
+        psa.InputError, match="'monitor_voltage', but the model 'psa' does not give it"
+    ):
+        columns_of(psa.compose([flexure]), [r])
     result = columns_of(starting_model([r]), [r])
     assert result.fitted == ("monitor_voltage",)
     assert texts(result.left_out) == ("strain is left out: it never changes.",)
@@ -136,11 +132,11 @@ def test_a_column_that_the_model_cannot_give_is_refused_and_a_useless_one_left_o
     turned = replace(r, current=-np.gradient(time), monitor_voltage=None, strain=None)
     (statement,) = columns_of(starting_model([turned]), [turned]).left_out
     assert "does not follow the voltage as a capacitance's does" in str(statement)
-    with pytest.raises(InputError, match="column 'monitor_voltage': found no value"):
+    with pytest.raises(psa.InputError, match="column 'monitor_voltage': found no value"):
         replace(r, monitor_voltage=np.where(time > 0.5, np.nan, time))
 
 
-def test_a_turned_sign_is_told() -> None:
+def test_a_turned_sign_is_reported() -> None:
     r = plants.plain(1).record(1, "charge", samples=400)
     turned = replace(r, charge=-np.asarray(r.charge))
     for record, output in ((r, False), (turned, True)):
@@ -167,15 +163,15 @@ def test_a_turned_sign_is_told() -> None:
     ],
 )
 def test_decisions_in_words(now: dict[str, float], then: dict[str, float], sentence: str) -> None:
-    assert sentence in str(decided("monitor_voltage", now, then, 7.2, EFFECTS, clear=not now))
+    assert sentence in str(decided("monitor_voltage", now, then, 7.2, psa.EFFECTS, clear=not now))
 
 
 def test_a_column_explains_nothing_where_something_is_left() -> None:
     of = {"load_stiffness": 0.5, "sensor_nonlinearity": 0.5}
-    clear = str(decided("load_force", {}, of, 0.0, EFFECTS, clear=True))
+    clear = str(decided("load_force", {}, of, 0.0, psa.EFFECTS, clear=True))
     assert "load_stiffness is in the column" in clear
-    assert "nothing is named" in str(decided("load_force", {}, of, 0.0, EFFECTS, clear=False))
-    assert "decides nothing" in str(decided("load_force", {}, {}, 0.0, EFFECTS, clear=False))
+    assert "nothing is named" in str(decided("load_force", {}, of, 0.0, psa.EFFECTS, clear=False))
+    assert "decides nothing" in str(decided("load_force", {}, {}, 0.0, psa.EFFECTS, clear=False))
 
 
 def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> None:
@@ -193,7 +189,7 @@ def test_a_level_is_no_smaller_than_what_a_sensor_s_straightness_allows() -> Non
 
 
 @slow
-def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
+def test_a_second_sensor_distinguishes_a_bent_one_from_a_stiffening_load(tmp_path: Path) -> None:
     right = "sensor_nonlinearity"
     result = diagnosed(plants.bent_sensor, 0.03, "displacement_2", BENDS)
     assert [c.effect for c in result.causes] == [right]
@@ -207,14 +203,14 @@ def test_a_second_sensor_tells_a_bent_one_from_a_stiffening_load(tmp_path: Path)
     text = " ".join(psa.story(result).split())
     assert "With displacement_2 the stack with its load is ruled out" in text
     assert json.loads(result.to_json())["columns"][0]["named"] == {right: pytest.approx(1.0)}
-    write_report(result, tmp_path / "page.html", still=True)
+    psa.write_report(result, tmp_path / "page.html", still=True)
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "What the further columns decided" in page
     assert "With displacement_2" in page
 
 
 @slow
-def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
+def test_a_load_cell_distinguishes_a_bent_sensor_from_a_stiffening_load() -> None:
     """The measured load is an input; a load that stiffens is in the column then."""
     bent = diagnosed(plants.bent_sensor, 0.03, "load_force", BENDS)
     assert [c.effect for c in bent.causes] == ["sensor_nonlinearity"]
@@ -238,7 +234,7 @@ def test_a_load_cell_tells_a_bent_sensor_from_a_stiffening_load() -> None:
         (plants.saturating_stack, "saturation_of_strain", "the amplifier"),
     ],
 )
-def test_a_monitor_voltage_tells_the_amplifier_from_the_stack(
+def test_a_monitor_voltage_distinguishes_the_amplifier_from_the_stack(
     hide: Hide, right: str, place: str
 ) -> None:
     result = diagnosed(hide, 0.1, "monitor_voltage", VOLTAGES, "triangle")
@@ -261,7 +257,7 @@ def test_a_capacitance_that_grows_shows_in_the_charge_alone() -> None:
 @slow
 def test_a_column_of_a_clean_stack_raises_no_alarm() -> None:
     record = plants.plain(2).record(2, "current", samples=SAMPLES)
-    result = psa.diagnose([record], effects=[EFFECTS[n] for n in (*VOLTAGES, *CHARGES)])
+    result = psa.diagnose([record], effects=[psa.EFFECTS[n] for n in (*VOLTAGES, *CHARGES)])
     assert result.verdict == "adequate"
     (decided,) = result.columns
     assert "agrees with the model" in decided.sentence

@@ -3,22 +3,14 @@
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.identification import refitting
-from psa_casadi.identification.identify import identify
 from psa_casadi.identification.refitting import refit_or_keep
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.stacks import STACKS
-from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records import multisine, time_grid
 from psa_casadi.simulation.stepper import SimulationError
-from tests.identification.identified_plants import (
-    combinations,
-    identified,
-    noise,
-    plant,
-    values_of,
-)
+from tests.identification.identified_plants import combinations, identified, noise, plant
+from tests.model.stack_models import values_of
 from tests.tiers import slow, slow_but
 
 SEEDS = (2, 3, 4)
@@ -58,9 +50,9 @@ def test_what_is_not_determined_is_listed(seed: int) -> None:
 
 
 @slow
-def test_a_given_stiffness_scales_the_forces() -> None:
+def test_a_known_stiffness_scales_the_forces() -> None:
     record = plant(2)[1].slice(0, 2500)
-    assumed, inputs = identify([record]), identify([record], stiffness=1e7)
+    assumed, inputs = psa.identify([record]), psa.identify([record], stiffness=1e7)
     assert assumed.model.provenance.force_scale == "assumed"
     assert "Force scale assumed" in assumed.model.provenance.notes[0]
     assert inputs.model.provenance.force_scale == "given"
@@ -74,7 +66,7 @@ def test_a_given_stiffness_scales_the_forces() -> None:
     assert inputs.fit.rms == pytest.approx(assumed.fit.rms, rel=1e-3)
 
 
-def reference_record(p: dict[str, float], sigma: float) -> Record:
+def reference_record(p: dict[str, float], sigma: float) -> psa.Record:
     """Return a record of the reference from rest, with white noise (a share of the range)."""
     time = time_grid(0.8, 2e-3)
     swing = multisine(time, -0.45 * p["u_rated"], 0.45 * p["u_rated"], (4.0, 60.0), seed=3)
@@ -87,23 +79,23 @@ def reference_record(p: dict[str, float], sigma: float) -> Record:
         p, drive, time, initial=start, breakpoints=list(time[1:-1]), rtol=1e-8
     ).displacement
     white = np.random.default_rng(5).standard_normal(len(x))
-    return Record(
+    return psa.Record(
         name="reference", time=time, voltage=voltage, displacement=x + sigma * np.ptp(x) * white
     )
 
 
-def start_model(p: dict[str, float]) -> Model:
+def start_model(p: dict[str, float]) -> psa.Model:
     """Return a model with the right mechanics and a loop and lag that are far off."""
     wrong = {"k_L": 1.3 * p["k_L"], "A": 0.6 * p["A"], "beta": 0.0, "gamma": 0.0}
-    return compose(BASE, {**p, **wrong, "n": 1.2, "tau": 0.4 * p["tau"], "delta": 0.0})
+    return psa.compose(psa.BASE, {**p, **wrong, "n": 1.2, "tau": 0.4 * p["tau"], "delta": 0.0})
 
 
 @slow
 def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
     """With stiffness and masses right, every parameter is in its interval, the lag tau too."""
-    p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
+    p = {name: f.value for name, f in psa.STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
     record = reference_record(p, 3e-4)
-    result = identify([record], model=start_model(p))
+    result = psa.identify([record], model=start_model(p))
     assert result.fit.converged
     assert result.fit.rms == pytest.approx(3e-4 * record.range_m, rel=0.12)
     for name in ("k_L", "A", "beta", "gamma", "delta", "n", "tau"):
@@ -115,8 +107,8 @@ def test_intervals_cover_the_reference_where_the_mechanics_are_known() -> None:
 @slow
 def test_a_loop_sharper_than_any_allowed_sits_on_its_bound() -> None:
     """The model's exponent is at least 1; the reference bends with 0.6."""
-    p = {name: f.value for name, f in STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
-    result = identify([reference_record({**p, "n": 0.6}, 1e-4)], model=start_model(p))
+    p = {name: f.value for name, f in psa.STACKS["P-885.51"].values.items()} | {"tau": 3e-3}
+    result = psa.identify([reference_record({**p, "n": 0.6}, 1e-4)], model=start_model(p))
     assert result.model.values["n"] == 1.0
     assert "n" in result.determinacy.on_bound
     assert "'n' sits on a bound of its range; its interval means nothing." in result.warnings
@@ -127,7 +119,7 @@ def test_a_fit_that_is_cut_off_is_not_called_final(monkeypatch: pytest.MonkeyPat
     record = plant(2)[1].slice(0, 600)
     monkeypatch.setattr("psa_casadi.identification.refitting.POLISH", 1)
     monkeypatch.setattr("psa_casadi.identification.mechanics._LAST", 1)
-    result = identify([record])
+    result = psa.identify([record])
     assert result.warnings[0].startswith("The fit was cut off before it converged")
 
 

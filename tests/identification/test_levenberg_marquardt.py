@@ -114,7 +114,7 @@ def test_what_cannot_be_evaluated() -> None:
     np.testing.assert_allclose(result.theta, 0.98, atol=1e-6)
 
 
-def test_an_iteration_that_is_cut_off_says_so() -> None:
+def test_an_iteration_that_is_cut_off_reports_it() -> None:
     start = np.array([-1.2, 1.0])
     minimum = minimise(rosenbrock, start, OPEN, tolerance=1e-10, evaluations=4)
     assert minimum is not None

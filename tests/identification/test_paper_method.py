@@ -31,9 +31,8 @@ from tests.identification.paper_cases import (
     real_step,
     residues,
     step_response,
-    values,
 )
-from tests.model.stack_models import PAPER_STACKS
+from tests.model.stack_models import PAPER_STACKS, stack_values
 from tests.tiers import slow, slow_but
 from tests.voltages import steps
 
@@ -43,7 +42,7 @@ STACK = "P-885.51"
 @pytest.mark.parametrize("name", PAPER_STACKS)
 def test_exact_limits_give_exact_coefficients(name: str) -> None:
     """With 1 - g = -sum r_i e^(p_i t), the limits are K_m = (-1)^(m+1) sum r_i / p_i^m."""
-    p = values(name)
+    p = stack_values(name)
     limits = [(-1) ** (m + 1) * np.sum(residues(p) / poles(p) ** m).real for m in range(1, 7)]
     result = coefficients_of_limits(np.array(limits))
     np.testing.assert_allclose(result, coefficients_of_values(p), rtol=1e-3)
@@ -55,7 +54,7 @@ def test_moments_without_noise_and_with_a_little() -> None:
     The underdamped stack needs hardly any: 1e-9 is less than a simulation leaves.
     """
     time = np.linspace(0.0, 8e-3, 801)
-    over, under = values("WYDS0808020"), values("PTBS200")
+    over, under = stack_values("WYDS0808020"), stack_values("PTBS200")
 
     def errors(p: dict[str, float], noise: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         white = noise * np.random.default_rng(0).standard_normal(time.size)
@@ -72,7 +71,7 @@ def test_moments_without_noise_and_with_a_little() -> None:
 @pytest.mark.parametrize("name", PAPER_STACKS)
 def test_factors_reproduce_the_coefficients(name: str) -> None:
     """The poles do not show which part is which, but all six coefficients come back."""
-    p = values(name)
+    p = stack_values(name)
     exact = coefficients_of_values(p)
     named = dict(zip(COEFFICIENTS, exact.tolist(), strict=True))
     result, notes = mechanics_of(named, p["k_P"], p["k_B"])
@@ -82,8 +81,8 @@ def test_factors_reproduce_the_coefficients(name: str) -> None:
         assert result[key] == pytest.approx(p[key], rel=1e-4)
 
 
-def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
-    p = values("PTBS200")
+def test_a_zero_that_the_poles_do_not_allow_is_reported() -> None:
+    p = stack_values("PTBS200")
     named = dict(zip(COEFFICIENTS, coefficients_of_values(p).tolist(), strict=True))
     result, notes = mechanics_of({**named, "b_1": 1e-3}, p["k_P"], p["k_B"])
     assert "the poles allow" in str(notes[0])
@@ -92,7 +91,7 @@ def test_a_zero_that_the_poles_do_not_allow_is_told() -> None:
 
 @pytest.mark.parametrize("leading", slow_but([False], [False, True]))
 def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
-    p = values(STACK)
+    p = stack_values(STACK)
     if leading:
         p |= {key: share * p["k_L"] for key, share in LEADING.items()}
     result = hysteresis_part(find_loops([loop(leading=leading)]), p["k_L"] * compliance(p))
@@ -112,8 +111,8 @@ def test_the_loop_is_recovered_from_quiet_loops(leading: bool) -> None:
 @slow
 def test_the_whole_method_where_its_assumptions_hold() -> None:
     """A step without hysteresis and noise, long and dense; loops of the same stack."""
-    p = values(STACK)
-    records = [closed_step(values(STACK, **LINEAR), 8e-3, 40001), loop()]
+    p = stack_values(STACK)
+    records = [closed_step(stack_values(STACK, **LINEAR), 8e-3, 40001), loop()]
     paper_identification = paper_method(records, stiffness=p["k_B"])
     assert paper_identification.coefficients is not None
     for name, exact in zip(COEFFICIENTS, coefficients_of_values(p), strict=True):
@@ -133,7 +132,7 @@ def test_the_whole_method_where_its_assumptions_hold() -> None:
     assert np.sqrt(np.mean(on_loop**2)) < 0.003 * loop().range_m
 
 
-def test_steps_and_loops_are_told_by_their_voltage() -> None:
+def test_steps_and_loops_are_classified_by_their_voltage() -> None:
     time = time_grid(2.0, 1e-3)
     held = np.where(time < 0.5, 10.0, 60.0)
     shapes = {
@@ -170,7 +169,7 @@ def _late_loop() -> Record:
 
 
 def _quiet(duration: float = 8e-3, samples: int = 40001, **changes: float) -> Record:
-    return closed_step(values(STACK, **LINEAR, **changes), duration, samples)
+    return closed_step(stack_values(STACK, **LINEAR, **changes), duration, samples)
 
 
 #: Records, and the sentence on them.
@@ -179,11 +178,11 @@ FAILURES: dict[str, tuple[Callable[[], list[Record]], str]] = {
     "no loop": (lambda: [_quiet()], "No record is a loop"),
     "truncated": (lambda: [_quiet(1e-3)], "the window truncates the response"),
     "noise": (
-        lambda: [closed_step(values(STACK, **LINEAR), 4e-3, 4001, 1e-5)],
+        lambda: [closed_step(stack_values(STACK, **LINEAR), 4e-3, 4001, 1e-5)],
         "white noise of 1e-05 of the step",
     ),
     "ringing": (
-        lambda: [closed_step(values("PTBS200", **LINEAR), 8e-3, 8001)],
+        lambda: [closed_step(stack_values("PTBS200", **LINEAR), 8e-3, 8001)],
         "the response rings (it overshoots by",
     ),
     "signs": (lambda: [_quiet(1e-3)], "not larger than zero"),
@@ -222,7 +221,7 @@ def test_every_condition_that_fails_has_its_sentence(case: str) -> None:
 
 
 @slow
-def test_nothing_is_said_against_a_step_that_serves() -> None:
+def test_no_warning_concerns_a_step_that_serves() -> None:
     assert linear_part(find_steps([_quiet(6e-3, 40001)])[0])[1] == []
     paper_identification = paper_method([_quiet(6e-3, 40001), loop()])
     assert not any(

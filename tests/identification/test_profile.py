@@ -7,35 +7,31 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import Fit, fit
 from psa_casadi.identification.profile import PROFILE_LIMIT, Profile, profile
-from psa_casadi.model.compose import Model
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import stack_model
-from psa_casadi.records import Record, multisine, time_grid
+from psa_casadi.records import multisine, time_grid
 from psa_casadi.records.split import whole
 from psa_casadi.report.plots.findings import profile_plot
 from psa_casadi.report.words.notes import profile_sentences
-from psa_casadi.simulation.simulate import simulate
 
 SIGMA = 2e-8
 #: The lags of wafers and bonding layers are far below the sampling: a tenth and less of it.
 SAMPLE = 2e-3
 
 
-def plant() -> Model:
-    return stack_model("demo").with_values({"delta": -0.5, "n": 1.3, "tau": 3e-3, "c_B": 8e3})
+def plant() -> psa.Model:
+    return psa.stack_model("demo").with_values({"delta": -0.5, "n": 1.3, "tau": 3e-3, "c_B": 8e3})
 
 
-def record_of(model: Model, seed: int, noise: float = SIGMA) -> Record:
+def record_of(model: psa.Model, seed: int, noise: float = SIGMA) -> psa.Record:
     time = time_grid(400 * SAMPLE, SAMPLE)
     voltage = multisine(time, 2.0, 60.0, (3.0, 40.0), seed=seed)
-    x = simulate(model, time, voltage).displacement
+    x = psa.simulate(model, time, voltage).displacement
     x = x + noise * coloured(seed, len(time))
-    return Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
+    return psa.Record(name=f"r{seed}", time=time, voltage=voltage, displacement=x)
 
 
 def coloured(seed: int, count: int) -> FloatArray:
@@ -103,7 +99,7 @@ def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
 
 def test_a_parameter_without_influence_is_open_on_both_sides() -> None:
     """The time constant of a creep of gain 0 changes nothing."""
-    creep = EFFECTS["slow_creep"]
+    creep = psa.EFFECTS["slow_creep"]
     model = plant().with_effect(creep)
     free = next(q.name for q in creep.parameters if q.name != creep.gain)
     experiments = [whole(record_of(plant(), 1))]
@@ -130,7 +126,7 @@ def test_a_lag_below_the_sampling_is_bounded_from_above_only() -> None:
     assert "nothing bounds it from below" in sentence
 
 
-def test_a_fit_that_stopped_short_is_told_so() -> None:
+def test_a_fit_that_stopped_short_is_reported() -> None:
     result = fitted("k_L", "tau")
     theta = result.theta.copy()
     error = determinacy(result).standard_errors["tau"]
@@ -147,7 +143,7 @@ def test_a_fit_that_stopped_short_is_told_so() -> None:
 
 def test_a_parameter_that_was_not_searched_has_no_profile() -> None:
     result = fitted("k_L", "tau")
-    with pytest.raises(InputError, match=r"'m_P' was not searched in this fit.*k_L, tau"):
+    with pytest.raises(psa.InputError, match=r"'m_P' was not searched in this fit.*k_L, tau"):
         profile(result, "m_P")
 
 

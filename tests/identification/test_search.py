@@ -12,8 +12,8 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.identification.mechanics import exchanges
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.records import Record
+from tests.model.stack_models import stack_values
 from tests.studies.benchmarks.coverage import one_run
 from tests.studies.benchmarks.records import clean_loops, with_noise
 from tests.tiers import slow
@@ -21,12 +21,8 @@ from tests.tiers import slow
 pytestmark = pytest.mark.xdist_group("search")
 
 
-def truth(name: str) -> dict[str, float]:
-    return {key: figure.value for key, figure in STACKS[name].values.items()}
-
-
 @slow
-def test_a_stack_is_found_from_its_records_alone() -> None:
+def test_a_stack_is_identified_from_its_records_alone() -> None:
     """Step, loops and multisine of the reference with 0.1 % noise, without a start."""
     run = one_run("PTBS200", 3)
     assert run.converged
@@ -41,7 +37,7 @@ def test_a_stack_is_found_from_its_records_alone() -> None:
 
 
 def test_exchanging_twice_changes_nothing() -> None:
-    p = truth("P-885.51")
+    p = stack_values("P-885.51")
     again = {}
     for what, values in exchanges(p):
         moved = {**p, **values}
@@ -50,7 +46,7 @@ def test_exchanging_twice_changes_nothing() -> None:
     for what in ("drive lag and creep lag", "wafers and bonding layers"):
         for name, value in p.items():
             assert again[what][name] == pytest.approx(value, rel=1e-12), name
-    assert len(list(exchanges(truth("PTBS200")))) == 2  # a ringing oscillator is no lag
+    assert len(list(exchanges(stack_values("PTBS200")))) == 2  # a ringing oscillator is no lag
     single = {k: v for k, v in p.items() if k not in ("k_P", "k_B")}
     assert [what for what, _ in exchanges(single)] == ["drive lag and creep lag"]
 
@@ -64,9 +60,9 @@ def _response(p: dict[str, float], frequency: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(("part", "other"), ["PB", "BP"])
-def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
+def test_a_slow_pole_next_to_a_cancelled_zero_may_be_the_creep_lag(part: str, other: str) -> None:
     """With a creep lag that cancels the zero, the oscillator's slow pole is all that shows."""
-    p = truth("demo")
+    p = stack_values("demo")
     p |= {f"k_{part}": 3e8, f"c_{part}": 1e-3 * 3e8, f"m_{part}": 0.1, f"k_{other}": 5e7}
     slow, what = {**p, "tau": 1e-3 * 3e8 / 3.5e8}, {"P": "wafers", "B": "bonding layers"}[part]
     result = dict(exchanges(slow))[f"creep lag for the slow pole of the {what}"]
@@ -82,7 +78,7 @@ def test_a_slow_pole_beside_a_cancelled_zero_may_be_the_creep_lag(part: str, oth
 
 @cache
 def loops() -> list[Record]:
-    return with_noise(clean_loops(truth("P-885.51"))[2:4], 1e-3, seed=4)
+    return with_noise(clean_loops(stack_values("P-885.51"))[2:4], 1e-3, seed=4)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +86,7 @@ def identification() -> StackIdentification:
     return identify(loops())
 
 
-def test_every_record_has_its_own_noise_level() -> None:
+def test_every_record_has_a_separate_noise_level() -> None:
     quiet, loud = with_noise(loops()[:1], 2e-3, 1)[0], loops()[1]
     result = identify([quiet, loud])
     first, second = (float(np.std(result.fit.residuals[result.fit.parts[r]])) for r in (0, 1))
@@ -98,7 +94,7 @@ def test_every_record_has_its_own_noise_level() -> None:
     assert result.fit.sigma == pytest.approx((first, second), rel=0.1)
 
 
-def test_what_loops_leave_open_is_told_in_words(identification: StackIdentification) -> None:
+def test_what_loops_leave_open_is_reported_in_words(identification: StackIdentification) -> None:
     assert identification.fit.converged
     lags = {"tau", "R_s", "c_P", "c_B"}
     assert lags & set(identification.determinacy.undetermined)

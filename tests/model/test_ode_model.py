@@ -150,7 +150,7 @@ def _bridge(*, whole: bool) -> psa.Model:
     )  # fmt: skip
 
 
-def test_algebraic_equations_are_solved_beside_intermediates() -> None:
+def test_algebraic_equations_are_solved_next_to_intermediates() -> None:
     rng = np.random.default_rng(0)
     for _ in range(5):
         at = 0.0, rng.normal(), rng.normal(), rng.uniform(1e2, 1e4)
@@ -361,7 +361,7 @@ def neighbours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path
 
 
 @pytest.mark.parametrize("first", ["", "here", None])
-def test_installed_packages_announce_theirs_and_no_neighbour_stands_for_one(
+def test_installed_packages_announce_theirs_and_no_neighbour_replaces_one(
     first: str | None, neighbours: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if first is not None:  # as `python -m`, `python` and notebooks have it
@@ -374,7 +374,7 @@ def test_installed_packages_announce_theirs_and_no_neighbour_stands_for_one(
     assert sys.path == before
 
 
-def test_a_neighbour_stands_for_nothing_that_is_missing(
+def test_a_neighbour_replaces_nothing_that_is_missing(
     neighbours: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "site" / "gratings.py").unlink()

@@ -1,4 +1,4 @@
-"""The reference against solutions that need no integrator: matrix exponentials and closed forms."""
+"""The reference against closed forms; reciprocal coupling: Newton's third law at gain 1."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,16 +11,16 @@ from scipy.linalg import expm
 import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.common.units import FloatArray
+from psa_casadi.records import time_grid
 from psa_casadi.reference import Mechanics, Trajectory, from_samples, simulate
-from tests.model.stack_models import PAPER_STACKS
+from tests.model.random_models import random_model, random_point
+from tests.model.stack_models import LINEAR, PAPER_STACKS, plant_of, stack, stack_values
+from tests.studies.plants.base import Run, simulate_base
+from tests.studies.plants.mechanics import two_masses
+from tests.studies.plants.stack import Stack
 from tests.tiers import slow_but
 
-LINEAR = {"A": 0.0, "beta": 0.0, "gamma": 0.0, "delta": 0.0}
 SINGLE = {"m": 7e-3, "c": 90.0, "k": 9.6e7}
-
-
-def values(name: str = "PTBS200", **changes: float) -> dict[str, float]:
-    return {key: figure.value for key, figure in psa.STACKS[name].values.items()} | changes
 
 
 def linear_step(
@@ -63,7 +63,7 @@ def loop_width(trajectory: Trajectory, period: float) -> float:
 
 @pytest.mark.parametrize("stack", sorted(psa.STACKS))
 def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
-    p = values(stack) | LINEAR
+    p = stack_values(stack) | LINEAR
     times = np.linspace(0.0, 3e-3, 601)
     response = simulate(p, lambda _: 100.0, times)
     truth = linear_step(p, 100.0, 0.0, times, np.zeros(6))
@@ -76,7 +76,7 @@ def test_linear_step_response_is_the_matrix_exponential(stack: str) -> None:
 
 
 def test_jumps_and_load_enter_between_breakpoints() -> None:
-    p = values() | LINEAR
+    p = stack_values("PTBS200") | LINEAR
     times = np.linspace(0.0, 4e-3, 801)
     response = simulate(
         p,
@@ -97,7 +97,7 @@ def test_jumps_and_load_enter_between_breakpoints() -> None:
 
 def test_single_mass_rings_as_its_closed_form() -> None:
     """A light stack let go from x_0: x = x_0 e^(-s t) (cos w t + s/w sin w t)."""
-    p = values() | LINEAR | SINGLE
+    p = stack_values("PTBS200") | LINEAR | SINGLE
     times = np.linspace(0.0, 2e-3, 401)
     response = simulate(
         p, lambda _: 0.0, times, initial={"x": 1e-5}, mechanics="single_mass", rtol=1e-11
@@ -112,7 +112,7 @@ def test_single_mass_rings_as_its_closed_form() -> None:
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_monotonic_ramp_with_n_1_is_an_exponential_in_voltage(sense: float) -> None:
     """From rest upward, f_H = h_ref A/b (1 - e^(-b u/h_ref)) with b = beta - gamma."""
-    p = values(n=1.0, delta=0.0, hold_rate=1e-6)
+    p = stack_values("PTBS200", n=1.0, delta=0.0, hold_rate=1e-6)
     times = np.linspace(0.0, 1.0, 201)
     response = simulate(p, lambda t: sense * 150.0 * t, times)
     u, slope = response.states["u"], p["beta"] - p["gamma"]
@@ -122,7 +122,7 @@ def test_monotonic_ramp_with_n_1_is_an_exponential_in_voltage(sense: float) -> N
 
 
 def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
-    p = values()
+    p = stack_values("PTBS200")
     times = np.array([0.0, 0.099, 0.11, 0.5, 5.0])
     ramp = from_samples(np.array([0.0, 0.1]), np.array([0.0, 150.0]))
     f_H = simulate(p, ramp, times, breakpoints=(0.1,)).states["f_H"]
@@ -133,7 +133,7 @@ def test_hold_leaves_the_hysteresis_force_at_rest() -> None:
 @pytest.mark.parametrize("stack", PAPER_STACKS)
 @pytest.mark.parametrize("share", [0.0, -0.2])
 def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) -> None:
-    p = values(stack)
+    p = stack_values(stack)
     rated, period = p["u_rated"], 1.0
     times = np.linspace(0.0, 2.0, 1001)
     drive = triangle(share * rated, rated, period)
@@ -148,7 +148,7 @@ def test_the_papers_stacks_have_their_stroke_and_loop(stack: str, share: float) 
 
 
 def test_every_mistake_is_named_at_once() -> None:
-    p = values(C_p=-1e-6)
+    p = stack_values("PTBS200", C_p=-1e-6)
     del p["beta"]
     with pytest.raises(psa.InputError) as caught:
         simulate(p, lambda _: 0.0, np.array([0.0, 0.0]), initial={"z": 1.0}, rtol=1.0)
@@ -158,14 +158,16 @@ def test_every_mistake_is_named_at_once() -> None:
 
 
 def test_runaway_hysteresis_is_an_error_not_a_curve() -> None:
-    p = values(A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
+    p = stack_values("PTBS200", A=-5.0, beta=-40.0, gamma=0.0, n=2.0)
     with pytest.raises(RuntimeError, match="check these parameters"):
         simulate(p, lambda t: 2000.0 * t, np.array([0.0, 1.0]))
 
 
 def test_a_jump_that_is_no_breakpoint_is_an_error() -> None:
     with pytest.raises(RuntimeError, match="name the jump as a breakpoint"):
-        simulate(values(), lambda t: 100.0 if t < 1e-3 else -30.0, np.array([0.0, 4e-3]))
+        simulate(
+            stack_values("PTBS200"), lambda t: 100.0 if t < 1e-3 else -30.0, np.array([0.0, 4e-3])
+        )
 
 
 #: Samples of the stepper's input, linear in between; a sine's error between them is 5e-9 of it.
@@ -216,9 +218,9 @@ DRIVES = (
 )
 
 
-def stack_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
+def plant_values(stack: str, mechanics: Mechanics) -> dict[str, float]:
     """Return a named stack's values; for the single mass, both masses on springs in series."""
-    p = {name: figure.value for name, figure in psa.STACKS[stack].values.items()}
+    p = stack_values(stack)
     if mechanics == "single_mass":
         k = 1 / (1 / p["k_P"] + 1 / p["k_B"])
         p |= {"m": p["m_P"] + p["m_B"], "k": k, "c": p["c_B"]}
@@ -241,7 +243,7 @@ AGREEMENTS = [*ONCE, *(("WYDS0808020", "single_mass", drive) for drive in DRIVES
 def test_displacement_agrees_with_the_reference(
     stack: str, mechanics: Mechanics, drive: Drive
 ) -> None:
-    p = stack_values(stack, mechanics)
+    p = plant_values(stack, mechanics)
     model = psa.compose(psa.BASE if mechanics == "cascade" else psa.SIMPLIFIED, p)
     size, force = p["u_rated"], FORCE * p["k_L"] * p["u_rated"]
     duration = max(SHORTEST, LAGS * p["tau"])
@@ -272,3 +274,83 @@ def test_displacement_agrees_with_the_reference(
     ):
         difference = np.abs(result.outputs[name][every] - wanted).max()
         assert difference < 1e-5 * np.ptp(wanted), name
+
+
+EFFECT = psa.EFFECTS["reciprocal_coupling"]
+FASTEST = 1e-7
+
+
+def reciprocal(name: str, gain: float, **changes: float) -> psa.Model:
+    return stack(name, **changes).with_effect(EFFECT, {"reciprocal_gain": gain})
+
+
+def plant(name: str, **changes: float) -> Stack:
+    return plant_of(stack_values(name, **changes))
+
+
+def driven(name: str, duration: float, samples: int) -> Run:
+    """A plant under a step, a hold and a slower swing."""
+    s = plant(name)
+    time = time_grid(duration, duration / samples)
+    phase = time / duration
+    swing = 0.3 * np.sin(6.0 * np.pi * np.clip(phase - 0.4, 0.0, 0.5)) ** 2
+    voltage = s.u_rated * np.where(phase > 0.0, 0.5 + swing, 0.0)
+    return simulate_base(s, time, voltage, 8)
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.4, 1.0])
+def test_the_equations_are_those_of_remark_1(gain: float) -> None:
+    """At any state; at 1 the forces between the masses are equal and opposite."""
+    generator = np.random.default_rng(8)
+    for _ in range(5):
+        model = random_model((EFFECT,), generator, gains=False)
+        model = model.with_values({"reciprocal_gain": gain})
+        point = random_point(model, generator)
+        p = model.values
+        rate = np.array(
+            model.structure.f(point.time, point.x, point.u, model.parameter_vector())[0]
+        ).ravel()
+        z = dict(zip(model.state_names, point.x, strict=True))
+        dz = dict(zip(model.state_names, rate, strict=True))
+        pull = p["c_B"] * (z["v_x"] - z["v_y"]) + p["k_B"] * (z["x"] - z["y"])
+        elastic = p["c_P"] * z["v_y"] + p["k_P"] * z["y"]
+        size = abs(z["f_out"]) + abs(pull) + abs(elastic) + abs(point.u[1])
+        wafers = p["m_P"] * dz["v_y"] + elastic - z["f_out"] - gain * pull
+        tip = p["m_B"] * dz["v_x"] + pull - (1 - gain) * elastic - point.u[1]
+        assert abs(wafers) < 1e-12 * size
+        assert abs(tip) < 1e-12 * size
+        assert (dz["y"], dz["x"]) == (z["v_y"], z["v_x"])
+        if gain == 1.0:
+            whole_stack = p["m_P"] * dz["v_y"] + p["m_B"] * dz["v_x"]
+            assert whole_stack == pytest.approx(z["f_out"] - elastic + point.u[1], abs=1e-11 * size)
+
+
+@pytest.mark.parametrize("name", PAPER_STACKS)
+def test_a_step_is_that_of_two_masses_with_action_and_reaction(name: str) -> None:
+    """With hysteresis, against matrices and an exponential; the cascade is far away."""
+    run = driven(name, 2e-3, 2000)
+    truth = two_masses(run)
+    result, one_way = (
+        psa.simulate(reciprocal(name, g), run.times, run.command, from_rest_at_zero=True, rtol=1e-8)
+        for g in (1.0, 0.0)
+    )
+    size = np.ptp(truth)
+    assert np.abs(result.displacement - truth).max() < 2e-5 * size
+    assert np.abs(one_way.displacement - run.displacement).max() < 2e-5 * np.ptp(run.displacement)
+    ratio = truth[-1] / run.displacement[-1]
+    assert np.abs(truth - ratio * run.displacement).max() > 2e-3 * size
+
+
+@pytest.mark.parametrize("gain", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("name", ["PTBS200", "P-885.51"])
+def test_the_blocked_force_holds_the_output_at_zero(name: str, gain: float) -> None:
+    """Applied against the output as a load, it keeps x at 0, also while the stack rings."""
+    model = reciprocal(name, gain)
+    time = time_grid(1e-3, FASTEST)
+    voltage = 100.0 * (1.0 - np.cos(4e3 * np.pi * time))
+    free = psa.simulate(model, time, voltage, from_rest_at_zero=True, rtol=1e-8)
+    force = free.outputs["blocked_force"]
+    held = psa.simulate(model, time, voltage, load_force=-force, from_rest_at_zero=True, rtol=1e-8)
+    assert np.abs(held.displacement).max() < 1e-4 * np.ptp(free.displacement)
+    same = held.outputs["blocked_force"]
+    np.testing.assert_allclose(same, force, rtol=0, atol=1e-4 * np.ptp(force))

@@ -1,7 +1,9 @@
 """Records in files, what is read of them, and the messages on those that are not read."""
 
+import os
 import re
 import shlex
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ from numpy.typing import ArrayLike
 
 from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record
+from psa_casadi.records.read import apart
+from psa_casadi.records.read.samples import Outcome
 
 HEADER = "time [s],voltage [V],displacement [um]"
 ROWS = [f"{k / 1000},{k % 7},{k % 7 / 10}" for k in range(20)]
@@ -83,3 +87,22 @@ def offered(statement: str) -> dict[str, Any]:
     if "--sample-time" in words:
         requested["sample_time"] = float(words[words.index("--sample-time") + 1])
     return requested
+
+
+def read_by_fork(task: apart.FileTask) -> Outcome:
+    """Return what a fork of this process reads of a file: a library may crash or hang it."""
+    answer = Path(task.path).with_suffix(".json")
+    child = os.fork()
+    if not child:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, 5.0)
+        answer.write_text(apart.to_json(apart.read_here(task)))
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        return Outcome((f"{task.path}: is damaged.",))
+    return apart.from_json(answer.read_text())
+
+
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the rest of a test read binary files in this process."""
+    monkeypatch.setattr(apart, "read_apart", apart.read_here)

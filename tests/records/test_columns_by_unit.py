@@ -1,16 +1,22 @@
-"""Columns that a person recognises: by their units, and never against their names."""
+"""Columns by their units, never against their names; the head of a file as the page shows it."""
 
+import gzip
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 from scipy.io import savemat
 
+from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record
-from psa_casadi.records.read.columns import parse_columns
-from tests.records.record_files import T, V, X, assert_is, offered, refused, table
+from psa_casadi.records.read.apart import head_of
+from psa_casadi.records.read.columns import Field, parse_columns
+from tests.records.laboratory_bytes import Cell, xlsx
+from tests.records.record_files import T, V, X, assert_is, offered, refused, table, text
 
 
 def is_read(record: Record, t: float = 1.0, v: float = 1.0, x: float = 1e-6) -> None:
@@ -90,7 +96,7 @@ def test_what_a_name_speaks_against_is_left_alone(
         ("t,U_amp,x", "time=t:s,voltage=U_amp:V,displacement=x:um"),
     ],
 )
-def test_what_is_open_is_asked_and_never_suggested_against_a_unit(
+def test_what_is_open_is_requested_and_never_suggested_against_a_unit(
     head: str, line: str, tmp_path: Path
 ) -> None:
     columns = (T, V, X, X)[: head.count(",") + 1]
@@ -134,7 +140,7 @@ def test_columns_without_a_unit_have_that_of_the_name(tmp_path: Path) -> None:
         (["sep=,", "t [s],u [V],x [um]"], ",", "."),
     ],
 )
-def test_excels_first_line_says_what_separates_the_cells(
+def test_excels_first_line_sets_the_separator(
     head: list[str], mark: str, point: str, tmp_path: Path
 ) -> None:
     path = table(tmp_path / "a.csv", *head, mark=mark, point=point)
@@ -174,7 +180,7 @@ def test_a_recording_of_control_desk_is_read(tmp_path: Path, *, packed: bool) ->
     is_read(read_record(path, columns=columns), x=1e-9)
 
 
-def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
+def test_what_a_recording_leaves_open_is_requested(tmp_path: Path) -> None:
     path = tmp_path / "a.mat"
     for names, (drive, moved) in (
         (("Out1", "Out1"), ("Y.1", "Y.2")),
@@ -185,3 +191,89 @@ def test_what_a_recording_leaves_open_is_asked(tmp_path: Path) -> None:
         assert suggestion(recorded(path, *signals)) == line
         is_read(read_record(path, columns=line))
     assert suggestion(recorded(path, *signals, clocks=2)) == line  # the two clocks are the same
+
+
+ROWS = text().splitlines()
+
+
+def fields(*units: str) -> dict[str, Field]:
+    """Return the fields of a record whose columns are in order, in these units."""
+    names = ("time", "voltage", "displacement")
+    return {n: Field(k, u) for k, (n, u) in enumerate(zip(names, units, strict=True))}
+
+
+def test_names_units_and_first_rows_of_a_table(tmp_path: Path) -> None:
+    path = table(tmp_path / "a.csv", "of 12 March", "", "time [ms],Drive (V),x/um")
+    head = head_of(path, 3)
+    assert head.names == ("time", "Drive (V)", "x/um")
+    assert head.units == ("ms", "V", "um")
+    assert head.rows == tuple(tuple(row.split(",")) for row in ROWS[:3])
+    assert head.guess == fields("ms", "V", "um")
+    packed = tmp_path / "a.csv.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert head_of(packed, 3) == head
+
+
+def test_what_is_requested_is_guessed_as_it_is_suggested(tmp_path: Path) -> None:
+    head = head_of(table(tmp_path / "a.csv", "Elapsed (us),CH1,CH2"))
+    assert head.guess == fields("us", "V", "um")
+    head = head_of(table(tmp_path / "b.csv", "t (s),CH1 (mV),CH2 (mV)"))
+    assert head.units == ("s", "mV", "mV")
+    assert head.guess["voltage"] == Field(1, "mV")
+    assert head.guess["displacement"] == Field(2, "um")  # of a sensor's volts: to be scaled
+    head = head_of(table(tmp_path / "c.csv", "t (s),Drive Monitor (V),Setpoint (um)"))
+    assert head.guess == {"time": Field(0, "s"), "monitor_voltage": Field(1, "V")}
+
+
+def test_a_name_with_a_mark_of_the_option_is_no_name(tmp_path: Path) -> None:
+    head = head_of(table(tmp_path / "a.csv", '"time [s]","U, V","x: um"'))
+    assert head.names == ("time", "", "")
+    assert head.guess["voltage"] == Field(1, "V")
+
+
+def test_arrays_of_several_lengths(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, t=T, u_mV=V, x=X, fs=1e3 * np.ones(2))
+    head = head_of(path, 3)
+    assert head.names == ("t", "u_mV", "x", "fs")
+    assert head.units == ("", "mV", "", "")
+    assert head.rows == (
+        ("0", "0.5", "0.25", "1000"),
+        ("0.001", "1.5", "0.35", "1000"),
+        ("0.002", "2.5", "0.45", ""),
+    )
+    assert head.guess == fields("s", "mV", "um")
+
+
+def test_workbooks_and_parquet_files_have_the_same_head(tmp_path: Path) -> None:
+    names: list[Cell] = ["time [s]", "U_amp [V]", "note"]
+    cells: list[list[Cell]] = [[float(t), float(v), "ok"] for t, v in zip(T, V, strict=True)]
+    book, file = tmp_path / "a.xlsx", tmp_path / "a.parquet"
+    book.write_bytes(xlsx([names, *cells]))
+    columns = dict(zip(names, zip(*cells, strict=True), strict=True))
+    parquet.write_table(pyarrow.table({n: list(c) for n, c in columns.items()}), file)
+    for path in (book, file):
+        head = head_of(path, 2)
+        assert head.names == ("time", "U_amp", "note")
+        assert head.units == ("s", "V", "")
+        assert [row[1:] for row in head.rows] == [("0.5", "ok"), ("1.5", "ok")]
+        assert head.guess["voltage"] == Field(1, "V")
+
+
+def test_the_head_of_one_of_several_tables(tmp_path: Path) -> None:
+    path = table(tmp_path / "a.csv", "time [s],U [V],x [um]")
+    second = ["run 2", "Clock [ms],Drive [V],Probe [nm]", *ROWS, ""]
+    path.write_text("\n".join([path.read_text(), *second]))
+    assert head_of(path).tables == ("1", "2")
+    assert head_of(path).names == ("time", "U", "x")
+    assert head_of(path, table="2").units == ("ms", "V", "nm")
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.mat", "a.xlsx", "a.parquet", "a.npz"])
+def test_a_file_that_is_none_is_refused(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    with pytest.raises(InputError, match="there is no such file"):
+        head_of(path)
+    path.write_bytes(b"PK\x03\x04\x00\x00\x08")
+    with pytest.raises(InputError, match=name):
+        head_of(path)

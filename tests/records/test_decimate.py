@@ -165,7 +165,7 @@ def test_parts_of_a_long_record_show_every_motion() -> None:
     assert f"{parts[1].time[0]:.4g} s" in statement[0]
 
 
-def test_short_records_stay_whole_beside_a_long_one() -> None:
+def test_short_records_stay_whole_next_to_a_long_one() -> None:
     short, long = night(30_000), night(500_000)
     parts, statement = excerpts([long, short])
     assert parts[-1] is short

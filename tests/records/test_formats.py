@@ -21,8 +21,7 @@ from psa_casadi.records.read import apart
 from psa_casadi.records.read.columns import parse_columns
 from tests.records import laboratory_bytes
 from tests.records.laboratory_bytes import hdf5, parquet, tdms
-from tests.records.reading_here import here
-from tests.records.record_files import HEADER, ROWS, assert_is, kept, problems_of, write
+from tests.records.record_files import HEADER, ROWS, assert_is, here, kept, problems_of, write
 
 N = 24
 T = np.arange(N) / 8.0
@@ -123,7 +122,7 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
     assert "line 1, column 'y': has no unit" in problem
 
 
-def test_what_is_said_of_one_file_stands_for_what_is_said_of_all(tmp_path: Path) -> None:
+def test_options_for_one_file_apply_to_all(tmp_path: Path) -> None:
     text = "time=t:s,voltage=U:V,displacement=y:um"
     mine = ",".join(f"b.csv@{part}" for part in ("time=t:ms", "voltage=CH1:V", "displacement=y:um"))
     first = write(tmp_path / "a.csv", "t,U,y", *ROWS)
@@ -156,7 +155,7 @@ def test_mistakes_of_the_columns_option(text: str, expected: str) -> None:
     assert expected in problem
 
 
-def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
+def test_mistakes_of_a_matlab_file_are_reported_at_once(tmp_path: Path) -> None:
     t, y = T.copy(), Y.copy()
     t[5], y[9] = t[3], np.inf
     path = mat(tmp_path / "a.mat", {"t": t, "u": np.r_[U[:4], np.nan, U[5:]], "y": y, "z": Y[:7]})
@@ -177,7 +176,7 @@ def test_mistakes_of_a_matlab_file_are_told_at_once(tmp_path: Path) -> None:
     assert "array 'z' (displacement) has 7 values, 'time' has 24" in problem
 
 
-def test_files_that_are_not_what_their_ending_says(tmp_path: Path) -> None:
+def test_files_that_differ_from_their_ending(tmp_path: Path) -> None:
     text = "\n".join([HEADER, *ROWS]).encode()
     broken = b"MATLAB 7.3".ljust(512) + b"\x89HDF\r\n\x1a\n" + b"x" * 50
     for name, content, kind in (
@@ -284,6 +283,6 @@ def test_dates_in_workbooks_and_instants_of_tdms(tmp_path: Path) -> None:
     is_read(read_record(tmp_path / "a.tdms"))
 
 
-def test_a_sample_rate_beside_the_arrays_is_their_clock(tmp_path: Path) -> None:
+def test_a_sample_rate_next_to_the_arrays_is_their_clock(tmp_path: Path) -> None:
     rate = {"voltage_V": U, "displacement_um": Y, "fs": 8.0}
     is_read(read_record(mat(tmp_path / "a.mat", rate)))

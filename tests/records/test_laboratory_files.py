@@ -157,7 +157,7 @@ def test_what_cannot_be_decided_ends_with_the_line_to_type(form: str, tmp_path: 
         ("t,V,x [um]", "voltage=V", "voltage=V,time=t:s"),
     ],
 )
-def test_the_line_to_type_is_told_once_and_works(
+def test_the_line_to_type_is_reported_once_and_works(
     head: str, columns: str | None, line: str, tmp_path: Path
 ) -> None:
     time = 1e3 * T if ":ms" in line else T
@@ -176,7 +176,7 @@ def test_a_damaged_gzip_file_is_refused(spoil: Callable[[bytes], bytes], tmp_pat
         read_record(path)
 
 
-def test_a_sample_time_stands_for_a_column(tmp_path: Path) -> None:
+def test_a_sample_time_replaces_a_column(tmp_path: Path) -> None:
     path = kept(tmp_path, "a.npz", npz({"voltage": V, "displacement_um": X}))
     with pytest.raises(InputError, match=r"give the time between samples: --sample-time 0\.001"):
         read_record(path)
@@ -199,7 +199,7 @@ def test_channels_of_several_instants_are_no_record(tmp_path: Path) -> None:
         read_record(path)
 
 
-def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
+def test_a_mistake_in_a_workbook_is_reported_with_its_row(tmp_path: Path) -> None:
     rows: list[list[float | str]] = [[*row] for row in ROWS]
     rows[4][1] = "off"
     path = kept(tmp_path, "a.xlsx", xlsx([["t [s]", "V [V]", "x [um]"], *rows]))
@@ -207,7 +207,7 @@ def test_a_mistake_in_a_workbook_is_told_with_its_row(tmp_path: Path) -> None:
         read_record(path)
 
 
-def test_a_scale_says_what_one_in_the_file_is(tmp_path: Path) -> None:
+def test_a_scale_defines_the_unit_in_the_file(tmp_path: Path) -> None:
     path = kept(tmp_path, "a", text("x-axis,1,2", "second,Volt,Volt"))
     record = read_record(path, columns="time=x-axis,voltage=1:15V,displacement=2:-2.5e0 um")
     np.testing.assert_allclose(record.voltage, 15.0 * V, rtol=1e-12)

@@ -13,9 +13,8 @@ from scipy.io import savemat
 from psa_casadi.common.errors import InputError
 from psa_casadi.records import Record, read_record, read_records
 from tests.records.laboratory_bytes import Cell, hdf5, mat, npz, parquet, tdms, xlsx
-from tests.records.reading_here import here
 from tests.records.record_files import HEADER as HEAD
-from tests.records.record_files import assert_is, kept, offered, refused, text
+from tests.records.record_files import assert_is, here, kept, offered, refused, text
 from tests.tiers import slow_but
 
 N = 40
@@ -134,7 +133,7 @@ def test_numbers_as_programs_write_them(how: str, tmp_path: Path) -> None:
     is_read(read_record(written(tmp_path, text)))
 
 
-def test_comments_remarks_and_what_stands_below_are_no_samples(tmp_path: Path) -> None:
+def test_comments_remarks_and_lines_below_are_no_samples(tmp_path: Path) -> None:
     lines = table(HEAD).splitlines()
     lines[9:9] = ["# the door was opened", "% gain 10", "; later"]
     lines += ["Mean,50.0,5.0", "End of data"]
@@ -219,7 +218,7 @@ def test_several_tables_are_listed_chosen_and_taken_together(
         is_read(read_record(path, columns="table=2"), v=2 * V)
 
 
-def test_packets_have_no_time_of_their_own(tmp_path: Path) -> None:
+def test_packets_have_no_separate_time(tmp_path: Path) -> None:
     packets = table(HEAD, columns=(np.tile([0.0, 1e-5], N // 2), V, X))
     path = written(tmp_path, packets)
     statement = refused(path)
@@ -232,7 +231,7 @@ def channel(values: Any, unit: str, time: Any = T) -> str:
     return table(f"time [s],channel [{unit}]", columns=(time, values))
 
 
-def test_channels_in_files_of_their_own_are_joined(tmp_path: Path) -> None:
+def test_channels_in_separate_files_are_joined(tmp_path: Path) -> None:
     one = written(tmp_path, channel(V, "V"), "v.csv")
     two = written(tmp_path, channel(X, "um"), "x.csv")
     assert "files of one channel each are joined as FILE+FILE" in refused(one)
@@ -271,7 +270,7 @@ def tektronix(name: str, values: Any) -> str:
     return "\n".join(f"{cell},,{t:.12f},{v:10.5f}," for cell, t, v in rows)
 
 
-def test_settings_beside_the_samples_are_no_samples(tmp_path: Path) -> None:
+def test_settings_next_to_the_samples_are_no_samples(tmp_path: Path) -> None:
     channels = {"CH1": V, "CH2": X}
     paths = [written(tmp_path, tektronix(n, y), f"F0000{n}.CSV") for n, y in channels.items()]
     with pytest.raises(InputError) as caught:

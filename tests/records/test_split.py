@@ -74,7 +74,7 @@ def test_every_kind_of_stretch_is_fitted_and_held_out() -> None:
     assert coverage_notes([e]) == ()
 
 
-def test_what_is_not_held_out_is_told() -> None:
+def test_what_is_not_held_out_is_reported() -> None:
     voltage = with_a_hold()
     voltage[500:600] = triangle(100, 50)  # the hold fills one block, which is fitted
     (note,) = coverage_notes([split(record(voltage))])
@@ -82,7 +82,7 @@ def test_what_is_not_held_out_is_told() -> None:
     assert "held voltages" in str(note)
 
 
-def test_what_is_held_out_but_not_fitted_is_told() -> None:
+def test_what_is_held_out_but_not_fitted_is_reported() -> None:
     """Slow and wide loops are held out; their first tenth, which determines their start, too."""
     small, slow = 0.2 * triangle(1600, 50), triangle(1600, 800)
     result = texts(coverage_notes(divided([record(small)], [record(slow)])))
@@ -125,7 +125,7 @@ def test_missing_samples_are_neither_fitted_nor_held_out() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("quantum", [0.0, 0.5, 1.0])
-def test_white_noise_on_a_motion_is_found(seed: int, quantum: float) -> None:
+def test_white_noise_on_a_motion_is_detected(seed: int, quantum: float) -> None:
     """Rounding to a count q adds q^2/12 to the variance, which is white too."""
     t = np.arange(6000) * 1e-3
     motion = 200.0 * np.sin(2 * np.pi * 3.0 * t) + 80.0 * np.sin(2 * np.pi * 7.0 * t)

@@ -1,4 +1,4 @@
-"""Samples that a sensor has made are distinguished from those of a stack."""
+"""Samples that a sensor has made are distinguished from motions, which have kinks and jumps."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,10 +8,10 @@ import pytest
 from scipy.signal import lfilter
 
 from psa_casadi.common.notes import texts
-from psa_casadi.common.units import FloatArray
+from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.records import Record, multisine, sine, time_grid, triangle
 from psa_casadi.records.noise import quantum_of
-from psa_casadi.records.suspects import cleaned, suspects
+from psa_casadi.records.suspects import cleaned, spikes_in, suspects
 from tests.tiers import slow_but
 from tests.voltages import steps
 
@@ -95,7 +95,7 @@ def test_a_kick_of_the_load_is_not_suspect() -> None:
 @pytest.mark.parametrize("width", [1, 2, 3])
 @pytest.mark.parametrize("noise", ["white", "coloured", "fine steps"])
 @pytest.mark.parametrize("voltage", ["sine", "triangle", "steps"])
-def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int) -> None:
+def test_spikes_are_detected_and_nothing_else(voltage: str, noise: str, width: int) -> None:
     base = record(voltage, noise)
     y, draw = np.array(base.displacement), np.random.default_rng(4)
     spikes = np.zeros(T.size, dtype=bool)
@@ -110,7 +110,7 @@ def test_spikes_are_found_and_nothing_else(voltage: str, noise: str, width: int)
 
 @pytest.mark.parametrize("value", [0.0, 1.4 * RANGE, -0.3 * RANGE])
 @pytest.mark.parametrize("length", [5, 40, 300])
-def test_drop_outs_are_found(value: float, length: int) -> None:
+def test_drop_outs_are_detected(value: float, length: int) -> None:
     base = record("sine", "white")
     y = np.array(base.displacement)
     starts = [k for k in range(400, 9000, 1300) if abs(y[k] - value) > 0.2 * RANGE]
@@ -127,7 +127,7 @@ def test_drop_outs_are_found(value: float, length: int) -> None:
 
 
 @pytest.mark.parametrize("noise", ["white", "fine steps", "none"])
-def test_a_stuck_sensor_is_found(noise: str) -> None:
+def test_a_stuck_sensor_is_detected(noise: str) -> None:
     base = record("sine", noise)
     y = np.array(base.displacement)
     y[3300:3700] = y[3299]
@@ -208,3 +208,96 @@ def test_readings_repeated_to_the_last_digit_are_masked_where_noise_makes_none(
     assert result.counts["stuck"] == int(result.mask.sum()) < 1.1 * places.size + 10
     coarse = np.round(y / (1e-3 * RANGE)) * (1e-3 * RANGE)
     assert suspects(replace(inputs, displacement=coarse)).counts["stuck"] == 0
+
+
+N, DT = 3000, 1e-3
+SECONDS = DT * np.arange(N, dtype=np.float64)
+#: Input and output of a motion, without noise.
+Motion = Callable[[np.random.Generator], tuple[FloatArray, FloatArray]]
+
+
+def driven(u: FloatArray, frequency: float, damping: float) -> FloatArray:
+    """Return what a resonance [Hz] makes of an input; its gain at rest is 1."""
+    decay, turn = np.exp(-2.0 * np.pi * frequency * damping * DT), 2.0 * np.pi * frequency * DT
+    lower = [1.0, -2.0 * decay * np.cos(turn), decay**2]
+    return np.asarray(lfilter([sum(lower)], lower, u))
+
+
+def resonance(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Five samples a period."""
+    u = rng.standard_normal(N)
+    return u, driven(u, 200.0, 0.02)
+
+
+def tones(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    f = np.arange(5.0, 150.0, 0.5)
+    u = np.cos(2.0 * np.pi * np.outer(SECONDS, f) + rng.uniform(0.0, 6.28, f.size)).sum(axis=1)
+    return u, driven(u, 60.0, 0.05)
+
+
+def held_steps(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """What jumps with its input, and decays: a current after steps of the voltage."""
+    u = np.repeat(rng.choice([0.0, 1.0, 2.0], N // 100), 100)
+    return u, u - np.asarray(lfilter([0.2], [1.0, -0.8], u))
+
+
+def slow(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    u = np.sin(2.0 * np.pi * 2.0 * SECONDS) + 0.3 * np.sin(2.0 * np.pi * 7.3 * SECONDS)
+    return u, driven(u, 3.0, 0.7)
+
+
+def bounces(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Impacts that no input shows."""
+    y = np.abs(np.sin(2.0 * np.pi * 1.7 * SECONDS)) * np.exp(-0.3 * SECONDS)
+    return np.zeros(N), y
+
+
+MOTIONS = (resonance, tones, held_steps, slow, bounces)
+
+
+def spikes_of(u: FloatArray, y: FloatArray) -> BoolArray:
+    return spikes_in(y, u[:, None], 8.0, 1e-3 * float(np.ptp(y)), 3)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_spikes_in_any_motion_are_detected(motion: Motion, noise: float) -> None:
+    clean, there, hit, wrong = 0, 0, 0, 0
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u, y = motion(rng)
+        span = float(np.ptp(y))
+        y = y + noise * span * rng.standard_normal(N)
+        clean += int(spikes_of(u, y).sum())
+        spikes = np.zeros(N, dtype=np.bool_)
+        spikes[rng.choice(np.arange(4, N - 4), N // 100, replace=False)] = True
+        sizes = rng.choice([-1.0, 1.0], N) * rng.uniform(10.0 * noise + 0.05, 0.5, N) * span
+        mask = spikes_of(u, np.where(spikes, y + sizes, y))
+        there += int(spikes.sum())
+        hit += int((mask & spikes).sum())
+        wrong += int((mask & ~spikes).sum())
+    assert clean <= 1
+    assert hit > 0.8 * there
+    assert wrong <= 5
+
+
+@pytest.mark.parametrize("width", [2, 3])
+def test_a_spike_of_two_or_three_samples_is_detected_and_a_step_is_none(width: int) -> None:
+    rng = np.random.default_rng(1)
+    u, y = slow(rng)
+    y = y + 1e-3 * np.ptp(y) * rng.standard_normal(N)
+    y[500 : 500 + width] += 0.2 * np.ptp(y)
+    assert np.flatnonzero(spikes_of(u, y)).tolist() == [*range(500, 500 + width)]
+    y[500:] += 0.2 * np.ptp(y)
+    y[500 : 500 + width] -= 0.2 * np.ptp(y)
+    assert not spikes_of(u, y)[505:].any()
+
+
+def test_missing_samples_few_samples_and_constant_signals_have_no_spikes() -> None:
+    rng = np.random.default_rng(1)
+    u, y = tones(rng)
+    y[rng.choice(N, 100, replace=False)] = np.nan
+    assert not spikes_of(u, y).any()
+    assert not spikes_in(y[:50], u[:50, None], 8.0, 0.0, 3).any()
+    assert not spikes_in(np.full(N, np.nan), u[:, None], 8.0, 0.0, 3).any()
+    assert not spikes_in(np.ones(N), np.zeros((N, 0)), 8.0, 0.0, 3).any()

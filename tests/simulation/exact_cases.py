@@ -5,76 +5,72 @@ from functools import cache
 import casadi as ca
 import numpy as np
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.component import Component, Equations
-from psa_casadi.model.compose import Model
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.variables import Parameter, State
 from psa_casadi.simulation.simulate import input_samples
-from psa_casadi.simulation.stepper import run
 from tests.model.stack_models import at_ordinary_size, stack
 
 OUTPUT = "measured_displacement"
 #: Five voltages over rated voltage, as functions of the share of the record.
 VOLTAGES = ("sine", "triangle", "steps", "multisine", "ramps")
 #: The components below are known to no list of names.
-LAG = Component(
+LAG = psa.Component(
     name="second_lag",
     description="the voltage follows through one more lag",
     source="test",
-    parameters=(Parameter("tau_2", 3e-4, "s", (1e-7, 1.0), "time constant", log=True),),
-    states=(State("f_2", "N", "force after one more lag", 100.0),),
-    equations=lambda s: Equations(
+    parameters=(psa.Parameter("tau_2", 3e-4, "s", (1e-7, 1.0), "time constant", log=True),),
+    states=(psa.State("f_2", "N", "force after one more lag", 100.0),),
+    equations=lambda s: psa.Equations(
         der={"f_2": (0.2 * s.f_out - s.f_2) / s.tau_2}, add={"wafer_force": s.f_2}
     ),
 )
-CUBIC = Component(
+CUBIC = psa.Component(
     name="cubic_spring",
     description="a spring whose force grows with the third power",
     source="test",
-    parameters=(Parameter("cubic", 3e21, "N/m^3", (0.0, 1e24), "stiffness"),),
-    equations=lambda s: Equations(add={"tip_force": -s.cubic * s.x**3}),
+    parameters=(psa.Parameter("cubic", 3e21, "N/m^3", (0.0, 1e24), "stiffness"),),
+    equations=lambda s: psa.Equations(add={"tip_force": -s.cubic * s.x**3}),
 )
 #: Force from the displacement back to the hysteresis.
-FEEDBACK = Component(
+FEEDBACK = psa.Component(
     name="feedback",
     description="the displacement lowers the drive voltage",
     source="test",
-    parameters=(Parameter("back", 1e5, "V/m", (0.0, 1e9), "volts per metre"),),
-    equations=lambda s: Equations(add={"drive_voltage": -s.back * s.x}),
+    parameters=(psa.Parameter("back", 1e5, "V/m", (0.0, 1e9), "volts per metre"),),
+    equations=lambda s: psa.Equations(add={"drive_voltage": -s.back * s.x}),
 )
-KINK = Component(
+KINK = psa.Component(
     name="kink",
     description="a stop with a switch of its own",
     source="test",
-    equations=lambda s: Equations(
+    equations=lambda s: psa.Equations(
         add={"tip_force": -1e6 * ca.fmax(0, s.x - 3e-6)}, switches={"contact": s.x - 3e-6}
     ),
 )
 #: What jumps has a derivative of zero everywhere that CasADi looks.
-JUMP = Component(
+JUMP = psa.Component(
     name="jump",
     description="a force that sets in at a voltage",
     source="test",
-    equations=lambda s: Equations(add={"free_force": -5.0 * (s.u > 37.3)}),
+    equations=lambda s: psa.Equations(add={"free_force": -5.0 * (s.u > 37.3)}),
 )
 #: A force that depends on time alone.
-BEAT = Component(
+BEAT = psa.Component(
     name="beat",
     description="a tone at the tip",
     source="test",
-    parameters=(Parameter("beat_period", 1e-3, "s", (1e-9, 1.0), "period", log=True),),
-    equations=lambda s: Equations(
+    parameters=(psa.Parameter("beat_period", 1e-3, "s", (1e-9, 1.0), "period", log=True),),
+    equations=lambda s: psa.Equations(
         add={"tip_force": 20.0 * ca.sin(2.0 * np.pi * s.time / s.beat_period)}
     ),
 )
 
 
 @cache
-def with_effect(name: str, stack_name: str = "P-885.51") -> Model:
+def with_effect(name: str, stack_name: str = "P-885.51") -> psa.Model:
     """Return a stack with one effect at an ordinary size; "base" is the stack alone."""
     model = stack(stack_name)
-    return model if name == "base" else at_ordinary_size(model, EFFECTS[name])
+    return model if name == "base" else at_ordinary_size(model, psa.EFFECTS[name])
 
 
 def times(samples: int, step: float) -> FloatArray:
@@ -106,7 +102,7 @@ def composite(samples: int) -> FloatArray:
     return np.select([share < 0.4, share < 0.9], [sine, rest], 0.2)
 
 
-def inputs(model: Model, t: FloatArray, relative: FloatArray) -> FloatArray:
+def inputs(model: psa.Model, t: FloatArray, relative: FloatArray) -> FloatArray:
     """Return all inputs (n, nu) for a voltage over the rated one; a temperature wanders."""
     table = {"voltage": model.values["u_rated"] * relative}
     if "temperature" in model.input_names:
@@ -116,7 +112,7 @@ def inputs(model: Model, t: FloatArray, relative: FloatArray) -> FloatArray:
 
 
 def stepped(
-    model: Model,
+    model: psa.Model,
     t: FloatArray,
     u: FloatArray,
     x0: FloatArray,
@@ -125,7 +121,7 @@ def stepped(
     hold: str = "linear",
 ) -> FloatArray:
     """Return the measured displacement (n,) by the stepper."""
-    y = run(model, t, u, x0, rtol=rtol, hold=hold).y
+    y = psa.run(model, t, u, x0, rtol=rtol, hold=hold).y
     return y[:, model.output_names.index(OUTPUT)]
 
 

@@ -104,7 +104,7 @@ def test_binaries_for_other_platforms_need_the_extra() -> None:
 
 
 @pytest.mark.usefixtures("no_zig")
-def test_without_zig_the_host_is_compiled_by_its_own_compiler(
+def test_without_zig_the_host_compiler_is_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     commands = []
@@ -317,7 +317,7 @@ def test_a_library_of_another_user_is_not_loaded(calls: list[Path]) -> None:
 
 
 @posix
-def test_a_shared_place_where_all_keep_their_own_is_used(tmp_path: Path, calls: list[Path]) -> None:
+def test_a_shared_place_with_separate_copies_is_used(tmp_path: Path, calls: list[Path]) -> None:
     (tmp_path / "cache").mkdir()
     (tmp_path / "cache").chmod(0o1777)  # as /tmp is
     assert library().is_relative_to(tmp_path / "cache")

@@ -10,28 +10,23 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import psa_casadi as psa
 from psa_casadi import reference
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.start.ordinary import starting_model
-from psa_casadi.model.component import Component, Equations
-from psa_casadi.model.components import BASE, SIMPLIFIED
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.model.stacks import STACKS
 from psa_casadi.model.structure import structure_of
-from psa_casadi.records import read_record
 from psa_casadi.reference import Mechanics
 from psa_casadi.simulation import stepper
 from psa_casadi.simulation.compiler import FLAGS_VARIABLE, shared_library, vector_flags, zig_command
 from psa_casadi.simulation.exact import run as exact
 from psa_casadi.simulation.exact.run import run_exact, why_not
 from psa_casadi.simulation.exact.split import Split, split_of
-from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, record_inputs, simulate
+from psa_casadi.simulation.simulate import EXACT, STEPPER, accurate, record_inputs
 from psa_casadi.simulation.start import start_on
 from tests.export.c_host.build import tool
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
-from tests.model.test_reference import stack_values
+from tests.model.test_reference import plant_values
 from tests.simulation.exact_cases import (
     BEAT,
     CUBIC,
@@ -55,11 +50,11 @@ RTOL = 1e-6
 SAMPLES = 1500
 #: A few of the stack's lags in a sample, and many of them.
 SAMPLE_TIMES = (2e-5, 1e-3)
-NAMES = ("base", *EFFECTS)
+NAMES = ("base", *psa.EFFECTS)
 
 
 def compare(
-    model: Model, t: FloatArray, relative: FloatArray, rtol: float = RTOL, hold: str = "linear"
+    model: psa.Model, t: FloatArray, relative: FloatArray, rtol: float = RTOL, hold: str = "linear"
 ) -> tuple[float, str]:
     """Return the error of a run over the range, by a stepper that is far finer, and the way."""
     u = inputs(model, t, relative)
@@ -89,7 +84,7 @@ def test_every_stack_and_voltage_agrees_with_the_stepper(turn: int) -> None:
     rate, whose notch at a turn only the finest steps show.
     """
     ways = []
-    names = sorted(STACKS)
+    names = sorted(psa.STACKS)
     for k, stack_name in ((k, names[(turn + k) % len(names)]) for k in range(3)):
         kind = VOLTAGES[(turn + k) % len(VOLTAGES)]
         step = SAMPLE_TIMES[(turn // len(VOLTAGES) + k) % len(SAMPLE_TIMES)]
@@ -117,7 +112,7 @@ _EVEN, _SLOW = times(600, 1e-4), times(200, 1e-3)
 _UNEVEN = np.cumsum(np.repeat([1e-4, 1e-3, 2.5e-5], 200))
 _JUMPING = voltage("steps", np.linspace(0.0, 1.0, 600)) + 0.05 * composite(600)
 #: Effect or component, times, voltage over the rated one, hold.
-CASES: list[tuple[str | Component, FloatArray, FloatArray, str]] = [
+CASES: list[tuple[str | psa.Component, FloatArray, FloatArray, str]] = [
     *((n, _EVEN, _JUMPING, "zero") for n in ("base", "backlash", "voltage_saturation")),
     *((n, _UNEVEN, voltage("sine", _UNEVEN / _UNEVEN[-1]), "linear") for n in ("base", "backlash")),
     *(
@@ -130,12 +125,12 @@ CASES: list[tuple[str | Component, FloatArray, FloatArray, str]] = [
 
 
 @pytest.mark.parametrize(("what", "t", "relative", "hold"), CASES, ids=range(len(CASES)))
-def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
-    what: str | Component, t: FloatArray, relative: FloatArray, hold: str
+def test_held_inputs_few_time_steps_any_start_and_user_components_agree(
+    what: str | psa.Component, t: FloatArray, relative: FloatArray, hold: str
 ) -> None:
     """The stepper is taken for a corner of the clip at every jump, and where equations jump."""
-    if isinstance(what, Component):
-        model, most = compose((*BASE, what), stack("P-885.51").values), 2 * RTOL
+    if isinstance(what, psa.Component):
+        model, most = psa.compose((*psa.BASE, what), stack("P-885.51").values), 2 * RTOL
     else:
         model, most = with_effect(what), RTOL
     result, way = compare(model, t, relative, hold=hold)
@@ -143,17 +138,17 @@ def test_held_inputs_few_time_steps_any_start_and_own_components_agree(
     assert way == (STEPPER if what is JUMP else EXACT) or what == "voltage_saturation"
 
 
-def test_an_irregular_time_base_is_stepped_and_says_so() -> None:
+def test_an_irregular_time_base_is_stepped_and_that_is_reported() -> None:
     model, rng = stack("P-885.51"), np.random.default_rng(3)
     t = 1e-3 * (np.arange(300) + 0.01 * rng.standard_normal(300))
     v = 60.0 * (1.0 - np.cos(20.0 * t))
-    result = simulate(model, t, v)
+    result = psa.simulate(model, t, v)
     assert result.way == STEPPER
-    regular = simulate(model, times(300, 1e-3), v)
+    regular = psa.simulate(model, times(300, 1e-3), v)
     assert regular.way == EXACT
     # clocks have a few digits only: that is no other step
     rounded = np.round(times(300, 1e-3), 9) + 1.0e-3 * 2e-7 * rng.standard_normal(300)
-    assert simulate(model, rounded, v).way == EXACT
+    assert psa.simulate(model, rounded, v).way == EXACT
 
 
 TONES = [2.5e-4, *(pytest.param(q, marks=slow) for q in (3.1e-4, 1.25e-4, 6.25e-5))]
@@ -164,7 +159,7 @@ def test_a_tone_whose_period_divides_a_sample_is_resolved(period: float) -> None
     """It looks constant at start, quarter, half and end of a sample."""
     values = {**stack("P-885.51").values, "beat_period": period}
     t = times(200, 1e-3)
-    result, _ = compare(compose((*BASE, BEAT), values), t, voltage("sine", t / t[-1]))
+    result, _ = compare(psa.compose((*psa.BASE, BEAT), values), t, voltage("sine", t / t[-1]))
     assert result <= RTOL
 
 
@@ -184,12 +179,12 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
 
     The stepper has the corners and every tenth sample only.
     """
-    p = stack_values(stack_name, mechanics)
+    p = plant_values(stack_name, mechanics)
     corners = np.array([0.0, 0.05, 0.1, 0.101, 0.15, 0.35, 0.4])
     levels = np.array([0.0, 0.7, 0.7, 0.2, 0.2, 0.9, -0.1]) * p["u_rated"]
     t = times(401, 1e-3)
-    model = compose(BASE if mechanics == "cascade" else SIMPLIFIED, p)
-    result = simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
+    model = psa.compose(psa.BASE if mechanics == "cascade" else psa.SIMPLIFIED, p)
+    result = psa.simulate(model, t, np.interp(t, corners, levels), from_rest_at_zero=True)
     # its asymmetry goes on while the voltage comes to rest, which only the finest steps see
     assert result.way == EXACT or stack_name == "micromanipulator"
     path = reference.from_samples(corners, levels)
@@ -200,7 +195,7 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
     assert error(result.outputs["displacement"][every], true.displacement) <= RTOL
     few = np.union1d(t[every], corners)
     path_at_corners = np.interp(few, corners, levels)
-    rare = simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
+    rare = psa.simulate(model, few, path_at_corners, from_rest_at_zero=True, rtol=1e-10)
     assert rare.way == STEPPER
     displacement = rare.outputs["displacement"][np.isin(few, t[every])]
     assert error(displacement, true.displacement) <= RTOL
@@ -209,7 +204,7 @@ def test_ramps_and_holds_agree_with_the_reference(stack_name: str, mechanics: Me
 def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
     """At the demonstration's kinks, halving a step once where it errs by far is not enough."""
     with resources.as_file(resources.files("psa_casadi").joinpath("data", "demo.csv")) as path:
-        record = read_record(path)
+        record = psa.read_record(path)
     model, t = starting_model([record]), np.asarray(record.time - record.time[0])
     u = record_inputs(model, record, record.n)
     x0 = start_on(model, t, u).x
@@ -220,19 +215,19 @@ def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
 
 
 #: Force that the hysteresis softens: what it multiplies lies in a loop.
-SOFTER = Component(
+SOFTER = psa.Component(
     name="softer",
     description="a spring that the hysteresis softens",
     source="test",
-    equations=lambda s: Equations(add={"tip_force": -1e3 * s.f_H * s.x}),
+    equations=lambda s: psa.Equations(add={"tip_force": -1e3 * s.f_H * s.x}),
 )
 
 
-@pytest.mark.parametrize("base", [BASE, SIMPLIFIED], ids=["cascade", "single mass"])
-def test_every_effect_splits(base: tuple[Component, ...]) -> None:
+@pytest.mark.parametrize("base", [psa.BASE, psa.SIMPLIFIED], ids=["cascade", "single mass"])
+def test_every_effect_splits(base: tuple[psa.Component, ...]) -> None:
     present = {c.name for c in base}
-    whole = [e for e in EFFECTS.values() if set(e.needs) <= present]
-    assert len(whole) >= len(EFFECTS) - 1
+    whole = [e for e in psa.EFFECTS.values() if set(e.needs) <= present]
+    assert len(whole) >= len(psa.EFFECTS) - 1
     for components in (base, *((*base, e) for e in whole), (*base, *whole)):
         split = split_of(structure_of(components))
         assert isinstance(split, Split), split
@@ -249,8 +244,8 @@ def test_every_effect_splits(base: tuple[Component, ...]) -> None:
     ],
     ids=lambda c: getattr(c, "name", ""),
 )
-def test_what_does_not_split_says_why(component: Component, reason: str) -> None:
-    structure = compose((*BASE, component)).structure
+def test_what_does_not_split_reports_why(component: psa.Component, reason: str) -> None:
+    structure = psa.compose((*psa.BASE, component)).structure
     result = split_of(structure)
     assert isinstance(result, str)
     assert re.search(reason, result)
@@ -263,13 +258,13 @@ def test_sampled_states_do_not_split() -> None:
 
 def test_a_function_that_the_c_code_does_not_have_is_named() -> None:
     """The text is printed only where there is no library yet, so that it fails there."""
-    bent = Component(
+    bent = psa.Component(
         name="bent",
         description="a force by the inverse of a hyperbolic sine",
         source="test",
-        equations=lambda s: Equations(add={"free_force": ca.asinh(s.u / 10.0)}),
+        equations=lambda s: psa.Equations(add={"free_force": ca.asinh(s.u / 10.0)}),
     )
-    reason = why_not(compose((*BASE, bent)).structure, (OUTPUT,))
+    reason = why_not(psa.compose((*psa.BASE, bent)).structure, (OUTPUT,))
     assert reason is not None
     assert reason.startswith("operation")
 
@@ -290,7 +285,7 @@ def _plain_vectors(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     _clear()
 
 
-def _case() -> tuple[Model, FloatArray, FloatArray]:
+def _case() -> tuple[psa.Model, FloatArray, FloatArray]:
     """Return a stack with backlash, times and inputs."""
     model, t = with_effect("backlash"), times(400, 1e-4)
     return model, t, inputs(model, t, composite(400))

@@ -9,12 +9,9 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 from typer.testing import CliRunner
 
+import psa_casadi as psa
 from psa_casadi.cli.app import app
-from psa_casadi.common.errors import MachineError
-from psa_casadi.model.components import BASE
-from psa_casadi.model.compose import Model, Structure, compose
-from psa_casadi.model.effects import EFFECTS
-from psa_casadi.records import write_record
+from psa_casadi.model.compose import Structure
 from psa_casadi.records.excitation import time_grid, triangle
 from psa_casadi.report.words.tables import timings_table
 from psa_casadi.simulation import side_by_side as module
@@ -25,9 +22,7 @@ from psa_casadi.simulation.side_by_side import (
     one_thread_of_algebra,
     side_by_side,
 )
-from psa_casadi.simulation.simulate import simulate
-from psa_casadi.simulation.stepper import run
-from psa_casadi.simulation.timings import REST, Stage, stage, timed
+from psa_casadi.simulation.timings import REST, Stage, stage
 from tests.any_model.own_models import motor
 from tests.model.sampled_models import loop
 from tests.model.stack_models import stack
@@ -39,22 +34,22 @@ def _two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def base() -> Model:
+def base() -> psa.Model:
     return stack("P-885.51")
 
 
-def _with_effects(base: Model, *names: str) -> list[Model]:
-    return [base.with_effect(EFFECTS[n]) for n in names]
+def _with_effects(base: psa.Model, *names: str) -> list[psa.Model]:
+    return [base.with_effect(psa.EFFECTS[n]) for n in names]
 
 
 def test_a_failure_ahead_is_left_to_who_needs_the_model(
-    monkeypatch: pytest.MonkeyPatch, base: Model
+    monkeypatch: pytest.MonkeyPatch, base: psa.Model
 ) -> None:
     tried = []
 
     def why_not(structure: Structure, outputs: tuple[str, ...]) -> None:
         tried.append(outputs)
-        raise MachineError("no compiler")
+        raise psa.MachineError("no compiler")
 
     monkeypatch.setattr(module, "why_not", why_not)
     compiled([base, *_with_effects(base, "slow_creep")])
@@ -66,7 +61,7 @@ def test_models_without_a_displacement_are_compiled_for_all_outputs(
 ) -> None:
     """Where exact steps do not fit, the stepper is."""
     compiled_outputs: set[tuple[str, ...]] = set()
-    ready: list[Model] = []
+    ready: list[psa.Model] = []
 
     def why_not(structure: Structure, outputs: tuple[str, ...]) -> str | None:
         compiled_outputs.add(outputs)
@@ -111,14 +106,14 @@ def test_work_has_the_threads_that_are_wanted(
     assert (set(results) == {threading.get_ident()}) == alone
 
 
-MODEL = compose(BASE)
+MODEL = psa.compose(psa.BASE)
 
 
 def _simulate(unknowns: list[str]) -> None:
     with stage("in a worker"):
         t = np.linspace(0.0, 1e-3, 5)
         x0 = np.zeros(len(MODEL.state_names))
-        run(MODEL, t, np.zeros((5, len(MODEL.input_names))), x0, unknowns=unknowns)
+        psa.run(MODEL, t, np.zeros((5, len(MODEL.input_names))), x0, unknowns=unknowns)
 
 
 @stage("outer")
@@ -134,7 +129,7 @@ def test_stages_count_for_themselves_and_simulations_of_all_threads(
 ) -> None:
     monkeypatch.setenv(VARIABLE, "2")
     _work()  # compiled before
-    with timed() as spent:
+    with psa.timed() as spent:
         _simulate([])
         _work()
         _work()
@@ -147,7 +142,7 @@ def test_stages_count_for_themselves_and_simulations_of_all_threads(
 
 
 def test_a_stage_ends_with_an_error() -> None:
-    with timed() as spent:
+    with psa.timed() as spent:
         with pytest.raises(ZeroDivisionError), stage("failing"):
             _ = 1 / 0
         with stage("next"):
@@ -165,13 +160,13 @@ def test_the_table_adds_up() -> None:
     )
 
 
-def test_a_diagnosis_tells_its_stages(tmp_path: Path) -> None:
+def test_a_diagnosis_reports_its_stages(tmp_path: Path) -> None:
     grid = time_grid(1.0, 4e-3)
     voltage = triangle(grid, 0.0, 100.0, 4.0)
     noise = 1e-8 * np.random.default_rng(5).standard_normal(grid.size)
-    moved = simulate(MODEL, grid, voltage).displacement + noise
+    moved = psa.simulate(MODEL, grid, voltage).displacement + noise
     path = tmp_path / "a.csv"
-    write_record(path, {"time [s]": grid, "voltage [V]": voltage, "displacement [m]": moved})
+    psa.write_record(path, {"time [s]": grid, "voltage [V]": voltage, "displacement [m]": moved})
     result = CliRunner().invoke(app, ["diagnose", str(path), "--timings"])
     assert result.exit_code == 0, result.output
     table = result.stdout[result.stdout.index("stage ") :].splitlines()

@@ -4,17 +4,16 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from psa_casadi.common.errors import InputError
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
-from psa_casadi.model.components import BASE
+from psa_casadi.identification.start.ordinary import chosen_start
 from psa_casadi.model.components.stack import drive
-from psa_casadi.model.compose import Model, compose
-from psa_casadi.model.effects import EFFECTS
 from psa_casadi.model.structure import structure_of
+from psa_casadi.model.variables import Provenance
 from psa_casadi.simulation.compiler import fingerprint, generate_c
-from psa_casadi.simulation.simulate import input_samples, simulate
+from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import start_state
-from psa_casadi.simulation.stepper import SimulationError, run
+from psa_casadi.simulation.stepper import SimulationError
 from tests.model.stack_models import LINEAR, jacobian, sine, stack
 
 
@@ -29,25 +28,25 @@ from tests.model.stack_models import LINEAR, jacobian, sine, stack
 )
 @pytest.mark.parametrize("rtol", [1e-4, 1e-6])
 def test_result_does_not_depend_on_how_the_time_is_cut(
-    model: Model, factor: float, rtol: float
+    model: psa.Model, factor: float, rtol: float
 ) -> None:
     t = np.linspace(0.0, 2e-2, 41)
     v = sine(t, 100.0)
-    whole = simulate(model, t, v, rtol=rtol)
+    whole = psa.simulate(model, t, v, rtol=rtol)
     for seed in range(3):
         cuts = np.random.default_rng(seed).uniform(0.0, t[-1], 300)
         cut = np.union1d(t, cuts)
-        pieces = simulate(model, cut, np.interp(cut, t, v), rtol=rtol)
+        pieces = psa.simulate(model, cut, np.interp(cut, t, v), rtol=rtol)
         difference = pieces.displacement[np.isin(cut, t)] - whole.displacement
         assert pieces.steps > whole.steps + 100
         assert np.abs(difference).max() < factor * rtol * np.ptp(whole.displacement)
 
 
-def stepped(model: Model, t: FloatArray, voltage: FloatArray) -> int:
+def stepped(model: psa.Model, t: FloatArray, voltage: FloatArray) -> int:
     """Steps of the stepper at 1e-6 from rest at zero."""
     u = input_samples(model, t.size, {"voltage": voltage})
     start = start_state(model, [0.0, 0.0]).x
-    return run(model, t, u, start, rtol=1e-6).steps
+    return psa.run(model, t, u, start, rtol=1e-6).steps
 
 
 @pytest.mark.parametrize("form", ["sine 1 Hz", "sine 5 Hz", "triangle", "steps"])
@@ -90,7 +89,7 @@ def test_order_of_the_method_at_its_tolerances(
     t, u = np.array([0.0, end]), np.array([[0.0, 0.0], [rate * end, 0.0]])
     errors = []
     for count in counts:
-        steps = run(model, t, u, np.zeros(nx), rtol=rtol, max_step=end / count * (1 + 1e-9))
+        steps = psa.run(model, t, u, np.zeros(nx), rtol=rtol, max_step=end / count * (1 + 1e-9))
         assert count <= steps.steps <= 1.1 * count
         errors.append(np.abs(steps.x[-1] - truth)[5] / truth[5])
     assert errors[0] < 1e-3
@@ -100,12 +99,12 @@ def test_order_of_the_method_at_its_tolerances(
 
 def test_a_step_far_longer_than_the_drive_does_not_ring() -> None:
     """One step of 10^5 R_s C_p: L-stable methods forget the start, a trapezoid flips its sign."""
-    model = compose((drive,), {"R_s": 10.0, "C_p": 1e-6})
+    model = psa.compose((drive,), {"R_s": 10.0, "C_p": 1e-6})
     t = np.arange(4.0)
-    steps = run(model, t, np.zeros((4, 1)), np.array([100.0]), rtol=1e9)
+    steps = psa.run(model, t, np.zeros((4, 1)), np.array([100.0]), rtol=1e9)
     assert steps.steps == 3
     assert np.all(np.abs(steps.x[1:]) < 1e-2)
-    rising = run(model, t, np.full((4, 1), 70.0), np.array([0.0]), rtol=1e9)
+    rising = psa.run(model, t, np.full((4, 1), 70.0), np.array([0.0]), rtol=1e9)
     np.testing.assert_allclose(rising.x[1:, 0], 70.0, rtol=0, atol=1e-2)
 
 
@@ -113,7 +112,7 @@ def test_zero_order_hold_is_the_drive_s_exponential() -> None:
     model = stack("PTBS200")
     t = np.arange(31) * 1e-5
     v = np.where(t < 1e-4, 50.0, -20.0)
-    result = simulate(model, t, v, hold="zero", from_rest_at_zero=True, rtol=1e-9).states["u"]
+    result = psa.simulate(model, t, v, hold="zero", from_rest_at_zero=True, rtol=1e-9).states["u"]
     rc = model.values["R_s"] * model.values["C_p"]
     u = [0.0]
     for level in v[:-1]:
@@ -124,10 +123,10 @@ def test_zero_order_hold_is_the_drive_s_exponential() -> None:
 def test_load_force_meets_the_bonding_layers() -> None:
     model = stack("PTBS200")
     t = np.linspace(0.0, 0.1, 11)
-    held = simulate(model, t, np.zeros(11), load_force=np.full(11, 300.0))
+    held = psa.simulate(model, t, np.zeros(11), load_force=np.full(11, 300.0))
     np.testing.assert_allclose(held.displacement, 300.0 / model.values["k_B"], rtol=1e-9)
     assert not held.states["y"].any()
-    step = simulate(
+    step = psa.simulate(
         model, t, np.zeros(11), load_force=np.full(11, 300.0), from_rest_at_zero=True, rtol=1e-9
     )
     assert step.displacement[0] == 0.0
@@ -139,17 +138,17 @@ def test_a_failure_names_state_and_time() -> None:
     t = np.linspace(0.0, 1.0, 11)
     where = r"t = 0\.0\d+ s in state 'f_(H|out)'.*loosen the tol"
     with pytest.raises(SimulationError, match=where):
-        simulate(model, t, 2000.0 * t)
+        psa.simulate(model, t, 2000.0 * t)
 
 
 def test_a_limit_of_steps_stops_a_costly_trial() -> None:
     model = stack("PTBS200")
     t = np.array([0.0, 1.0])
     u = np.array([[0.0, 0.0], [100.0, 0.0]])
-    done = run(model, t, u, np.zeros(7))
+    done = psa.run(model, t, u, np.zeros(7))
     assert done.steps > 5
     with pytest.raises(SimulationError, match="too many steps"):
-        run(model, t, u, np.zeros(7), steps_limit=5)
+        psa.run(model, t, u, np.zeros(7), steps_limit=5)
 
 
 def test_the_steps_of_a_whole_run_are_bounded() -> None:
@@ -158,31 +157,70 @@ def test_the_steps_of_a_whole_run_are_bounded() -> None:
     t = np.linspace(0.0, 1e-2, 101)
     u = np.column_stack([50.0 * np.sin(600.0 * t), np.zeros_like(t)])
     x0 = np.zeros(len(model.state_names))
-    whole = run(model, t, u, x0)
+    whole = psa.run(model, t, u, x0)
     taken = whole.steps + whole.rejected
-    assert run(model, t, u, x0, steps_most=taken).steps == whole.steps
+    assert psa.run(model, t, u, x0, steps_most=taken).steps == whole.steps
     with pytest.raises(SimulationError, match="too many steps"):
-        run(model, t, u, x0, steps_most=taken - 1)
+        psa.run(model, t, u, x0, steps_most=taken - 1)
 
 
 def test_bad_samples_are_named() -> None:
     model, t = stack("PTBS200"), np.array([0.0, 0.1, 0.1])
-    with pytest.raises(InputError) as caught:
-        simulate(model, t, [0.0, np.nan, 1.0], load_force=[1.0])
+    with pytest.raises(psa.InputError) as caught:
+        psa.simulate(model, t, [0.0, np.nan, 1.0], load_force=[1.0])
     for words in ("do not strictly increase", "voltage has samples", "load_force has 1 samples"):
         assert words in str(caught.value)
-    with pytest.raises(InputError, match="no input 'load_force'"):
-        simulate(compose((drive,)), [0.0, 1.0], [0.0, 1.0], load_force=[0.0, 0.0])
-    with pytest.raises(InputError) as caught:
-        run(model, np.array([0.0, 1.0]), np.zeros((2, 1)), np.zeros(3), hold="cubic")
+    with pytest.raises(psa.InputError, match="no input 'load_force'"):
+        psa.simulate(psa.compose((drive,)), [0.0, 1.0], [0.0, 1.0], load_force=[0.0, 0.0])
+    with pytest.raises(psa.InputError) as caught:
+        psa.run(model, np.array([0.0, 1.0]), np.zeros((2, 1)), np.zeros(3), hold="cubic")
     for words in ("array u has the shape (2, 1)", "array x0", "hold 'cubic'"):
         assert words in str(caught.value)
 
 
 def test_a_fingerprint_differs_where_the_generated_text_does() -> None:
-    structures = [structure_of(BASE), structure_of(BASE[:2])]
-    structures += [structure_of((*BASE, e)) for e in EFFECTS.values() if not e.needs]
+    structures = [structure_of(psa.BASE), structure_of(psa.BASE[:2])]
+    structures += [structure_of((*psa.BASE, e)) for e in psa.EFFECTS.values() if not e.needs]
     prints = [fingerprint(s) for s in structures]
     texts = [repr(generate_c(s, sensitivities=True)) for s in structures]
     assert len(set(prints)) == len(set(texts)) == len(structures)
-    assert fingerprint(structure_of.__wrapped__(BASE)) == prints[0]
+    assert fingerprint(structure_of.__wrapped__(psa.BASE)) == prints[0]
+
+
+TIME = np.linspace(0.0, 0.02, 400)
+VOLTAGE = 50.0 * (1.0 - np.cos(2 * np.pi * 100.0 * TIME))
+RECORD = psa.Record(name="r", time=TIME, voltage=VOLTAGE, displacement=1e-7 * VOLTAGE)
+
+
+def _extended() -> psa.Model:
+    names = ("structural_mode", "hysteresis_memory", "load_stiffness", "slow_creep")
+    stack = psa.stack_model("P-885.51")
+    model = stack.with_components((*stack.components, *(psa.EFFECTS[n] for n in names)))
+    return model.with_values({str(c.gain): 0.05 for c in model.effects})
+
+
+@pytest.mark.parametrize(
+    "model", [_extended(), psa.compose(psa.SIMPLIFIED)], ids=["extended cascade", "one mass"]
+)
+def test_another_stiffness_changes_forces_and_no_displacement(model: psa.Model) -> None:
+    stiffness = "k_B" if "k_B" in model.values else "k"
+    moved = chosen_start([], model, 3.0 * model.values[stiffness])[0]
+    assert moved.values[stiffness] == pytest.approx(3.0 * model.values[stiffness])
+    before, after = psa.simulate(model, TIME, VOLTAGE), psa.simulate(moved, TIME, VOLTAGE)
+    size = np.ptp(before.displacement)
+    assert np.max(np.abs(after.displacement - before.displacement)) < 1e-6 * size
+    ratio = np.ptp(after.outputs["blocked_force"]) / np.ptp(before.outputs["blocked_force"])
+    assert ratio == pytest.approx(3.0, rel=1e-4)
+
+
+def test_a_start_states_whether_its_force_scale_is_known() -> None:
+    stack = psa.stack_model("P-885.51")
+    assumed = stack.with_values({}, provenance=Provenance(force_scale="assumed"))
+    model = stack.with_values({}, provenance=Provenance(force_scale="given"))
+    assert chosen_start([RECORD], None, None)[1] is False
+    assert chosen_start([RECORD], None, 6e7)[1] is True
+    assert chosen_start([RECORD], assumed, None) == (assumed, False)
+    assert chosen_start([RECORD], model, None) == (model, True)
+    both, known = chosen_start([RECORD], assumed, 6e7)
+    assert known
+    assert both.values["k_B"] == pytest.approx(6e7)

@@ -16,7 +16,7 @@ from psa_casadi.common.units import ComplexArray, FloatArray
 from psa_casadi.diagnosis.result import Verdict
 from psa_casadi.records.split import split
 from psa_casadi.simulation import device
-from tests.datasets.test_datasets_one_axis import N as PERIOD
+from tests.datasets.test_datasets import N as PERIOD
 from tests.studies.__main__ import app
 from tests.studies.benchmarks import changed, floors, mirror, names, peers, sampling
 from tests.studies.benchmarks import diagnose as study
@@ -85,7 +85,7 @@ def test_names_families_and_probabilities_are_counted() -> None:
     assert len(each.rows) == len(items)
 
 
-def test_a_pattern_of_names_that_no_case_has_is_told() -> None:
+def test_a_pattern_of_names_that_no_case_has_is_reported() -> None:
     with pytest.raises(psa.InputError, match="no case has 'exma/'"):
         names.run(silent, False, only="exma/")
 
@@ -136,7 +136,7 @@ RESULTS = [
 ]
 
 
-def test_shares_are_of_the_cases_as_visible_as_asked_for() -> None:
+def test_shares_are_of_the_cases_as_visible_as_requested() -> None:
     summary = study.result_tables(RESULTS)[0]
     reached = {row["figure"]: row["reached"] for row in summary.rows}
     assert {
@@ -212,7 +212,7 @@ def test_a_play_follows_behind_its_threshold_and_remembers_what_was_before() -> 
     np.testing.assert_allclose(play(v, 0.2, (1.0,)), [0.2, 0.8, 0.7, -0.8])
 
 
-def test_prior_sizes_tell_what_acts_from_what_does_not() -> None:
+def test_prior_sizes_distinguish_what_acts_from_what_does_not() -> None:
     rng = np.random.default_rng(3)
     features = rng.standard_normal((300, 64))
     kinds = np.r_[0, np.ones(3, dtype=int), np.full(60, 2)]
@@ -240,7 +240,7 @@ def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
 
 
 @slow
-def test_modes_are_found_in_a_broadband_record() -> None:
+def test_modes_are_detected_in_a_broadband_record() -> None:
     rng = np.random.default_rng(2)
     v = np.clip(0.25 * rng.standard_normal(700), -1.0, 1.0)
     truth, damping, x = (0.11, 0.23), 0.03, 0.3 * v
@@ -260,7 +260,7 @@ def test_modes_are_found_in_a_broadband_record() -> None:
 
 
 @slow
-def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
+def test_a_line_of_the_mains_is_detected_and_noise_is_none() -> None:
     rng = np.random.default_rng(8)
     v, noise = triangles(rng), 0.01 * rng.standard_normal(N)
     y = v + 0.02 * np.sin(2 * np.pi * 0.2531 * np.arange(N) + 1.0) + noise
@@ -272,7 +272,7 @@ def test_a_line_of_the_mains_is_found_and_noise_is_none() -> None:
 
 
 @slow
-def test_where_a_record_comes_from_is_found() -> None:
+def test_where_a_record_comes_from_is_identified() -> None:
     rng = np.random.default_rng(5)
     v = 0.4 * triangles(rng)
     result = floor_of([Part(v, plant(v, rng, state=1.0), ~HELD)]).histories[0]
@@ -313,7 +313,7 @@ def response_of(modes: mirror.Modes, frequency: FloatArray, amplitude: float) ->
     return whole
 
 
-def test_modes_are_found_in_responses() -> None:
+def test_modes_are_detected_in_responses() -> None:
     truth, frequency = structure(), np.linspace(0.0, mirror.RATE / 2, 1500)
     responses = {a: response_of(truth, frequency, a) for a in (0.1, 0.3)}
     for response in responses.values():

@@ -114,7 +114,7 @@ def test_the_score_of_answers_made_by_hand_is_as_counted(data: Path) -> None:
     assert [r["of"] for r in result["reliability"]] == [2, 1, 1]
 
 
-def test_malformed_answers_are_told_in_sentences(data: Path) -> None:
+def test_malformed_answers_are_reported_in_sentences(data: Path) -> None:
     give(data, "001", [{"gremlins": 0.9}], displacement_um=[1.0])
     put(data.parent / "answers" / "002.json", "{")
     put(data.parent / "answers" / "999.json", {})

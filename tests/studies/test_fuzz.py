@@ -126,7 +126,7 @@ def _counted(**options: object) -> Tally:
     return run([fake], 7, inputs={"fake": 10}, jobs=2, **options)  # type: ignore[arg-type]
 
 
-def test_every_way_to_fail_is_seen_and_counted(tmp_path: Path) -> None:
+def test_every_way_to_fail_is_detected_and_counted(tmp_path: Path) -> None:
     texts: list[str] = []
     tally = _counted(keep=tmp_path, progress=texts.append)
     kinds = {kind: n for (_, kind), n in tally.kinds.items()}
@@ -154,7 +154,7 @@ def test_one_seed_gives_one_set_of_inputs() -> None:
         assert len(set(first)) > 15
 
 
-def test_damage_changes_what_it_is_given() -> None:
+def test_damage_changes_its_input() -> None:
     data, tree = bytes(range(256)) * 4, {"a": [1, 2.5, {"b": "c"}], "d": None}
     changed = [damaged_bytes(data, Random(k)) != data for k in range(200)]
     assert sum(changed) > 190

@@ -159,7 +159,7 @@ def test_a_gain_of_zero_is_the_clean_record(
     assert lines == clean_lines
 
 
-def test_record_holds_what_the_truth_says(tmp_path: Path) -> None:
+def test_record_matches_its_truth(tmp_path: Path) -> None:
     truth = make_record("slow_creep", 3, tmp_path / "a.csv")
     make_record("slow_creep", 3, tmp_path / "b.csv")
     make_record("slow_creep", 4, tmp_path / "c.csv")
@@ -202,7 +202,7 @@ def test_every_voltage_starts_at_rest_and_stays_in_its_span(
 
 
 @pytest.mark.parametrize("effect", slow_but(["slow_creep"], ["slow_creep", "backlash"]))
-def test_visible_ratio_is_what_was_asked_for(effect: str, tmp_path: Path) -> None:
+def test_visible_ratio_is_what_was_requested(effect: str, tmp_path: Path) -> None:
     truth = make_record(effect, 4, tmp_path / "a.csv", visible=0.4)
     assert truth.visible == pytest.approx(0.4, rel=0.05)
     assert not truth.gain_limited

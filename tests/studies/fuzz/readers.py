@@ -34,7 +34,7 @@ from tests.any_model.own_models import cylinder, motor, oscillator, oven, pair, 
 from tests.export.fmu_models import model_named
 from tests.model.evidence_models import evident_model
 from tests.records.laboratory_bytes import gcs, hdf5, lvm, mat, named, npy, npz, parquet, tdms, xlsx
-from tests.records.reading_here import read_by_fork
+from tests.records.record_files import read_by_fork
 from tests.studies.fuzz.campaign import FALSE_PASS, Finding, Target
 from tests.studies.fuzz.damage import (
     WORDS,

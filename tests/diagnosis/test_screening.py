@@ -1,12 +1,18 @@
-"""Noise with a colour: its level from a residual's fast part, and a cause named in its presence."""
+"""The parts of screening: noise with a colour, spans of weights, trial sizes of effects."""
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, OwnColour, colour_of, left_correlation, own_colour
 from psa_casadi.diagnosis.noise import omnibus
+from psa_casadi.diagnosis.probes import Span, residual_jumps
+from psa_casadi.diagnosis.task import LIMITS
+from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.records.noise import first_order_noise, uncertain
+from psa_casadi.records.split import whole
 from tests.studies.plants.noise import coloured
 from tests.tiers import slow_but
 
@@ -19,7 +25,7 @@ def noise(correlation: float, seed: int = 4) -> FloatArray:
     return coloured(np.random.default_rng(seed).standard_normal(N), correlation)
 
 
-def test_white_noise_stays_white_whatever_is_slow_beside_it() -> None:
+def test_white_noise_stays_white_whatever_is_slow_in_it() -> None:
     triangle = 2.0 * np.abs((TIME / 0.15) % 2.0 - 1.0)
     steps = np.sign(np.sin(2.0 * np.pi * 1.4 * TIME))
     tone = np.sin(2.0 * np.pi * 157.0 * TIME)
@@ -101,7 +107,7 @@ def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
     assert result.colour.whiten(result.residuals).std() == pytest.approx(result.level, rel=0.02)
 
 
-def test_slow_waves_are_no_evidence_beside_a_random_walk() -> None:
+def test_slow_waves_are_no_evidence_next_to_a_random_walk() -> None:
     """White noise would speak for them with hundreds of nats."""
     walk = np.cumsum(np.random.default_rng(3).standard_normal(N))
     waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, N), np.arange(8)))
@@ -124,3 +130,36 @@ def test_the_noise_of_a_clock_that_jitters_grows_with_the_rate() -> None:
     assert white[fast].std() == pytest.approx(white[~fast].std(), rel=0.08)
     even = [_own(noise(0.0, k), np.zeros((N, 0)), rate).spread for k in range(20)]
     assert even == [None] * 20
+
+
+def test_noise_passes_the_threshold_no_more_often_than_along_one_direction() -> None:
+    """In 0.5 % of 40,000 draws, of any number of weights; hardly visible ones do not count."""
+    rng = np.random.default_rng(3)
+    level = chi2.isf(LIMITS.false_alarm, 1)
+    for size in (1, 3, 9):
+        unit, _ = np.linalg.qr(rng.standard_normal((50, size)))
+        for norms in (np.full(size, 30.0), np.geomspace(30.0, 1e-3, size)):
+            span = Span(unit.T @ unit, norms, LIMITS.false_alarm)
+            drawn = span.decrease(rng.standard_normal((40_000, 50)) @ unit)
+            assert np.mean(drawn > level) < 0.0065
+        assert np.mean(Span(unit.T @ unit, np.full(size, 30.0), LIMITS.false_alarm).decrease(
+            rng.standard_normal((40_000, 50)) @ unit) > level) > 0.0035  # fmt: skip
+
+
+def _loops() -> tuple[FloatArray, FloatArray]:
+    t = np.linspace(0.0, 4.0, 4001)
+    return t, 50.0 - 40.0 * np.cos(2 * np.pi * t) * (1.0 - 0.15 * t)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.85])
+def test_the_place_of_a_jump_is_read_off_the_residual(share: float) -> None:
+    """Under noise as large as half the jump; in the model's displacement, whatever the offset."""
+    model = psa.compose(psa.BASE)
+    t, voltage = _loops()
+    x = psa.simulate(model, t, voltage).displacement
+    noise = 1e-8 * np.random.default_rng(4).standard_normal(t.size)
+    place = float(x.min() + share * np.ptp(x))
+    reading = x + 2e-8 * (x > place) + noise + 3e-6
+    experiments = (whole(psa.Record(name="r", time=t, voltage=voltage, displacement=reading)),)
+    places = residual_jumps(fit(model, experiments, ["k_L", "A"], sigma=[2e-8]))
+    assert min(abs(p - place) for p in places) < 0.01 * np.ptp(x)
