@@ -15,7 +15,7 @@ SECTIONS = {
     "Many devices": """batch BatchRun Job Options compare Comparison read_findings write_comparison
         write_population""",
     "Models": """Model stack_model STACKS ode_model fmu_model table compose save_model load_model
-        Component Equations Symbols Parameter State Input Output Publication own_effects EFFECTS
+        Component Equations Symbols Parameter State Input Output Publication load_effects EFFECTS
         BASE SIMPLIFIED COMPONENTS""",
     "Simulation": """simulate simulate_record simulate_many run settled_at memory_after Trajectory
         linearize Linear margins observer""",

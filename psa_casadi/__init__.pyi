@@ -53,7 +53,6 @@ from psa_casadi.model.nanopositioner import controller_for as controller_for
 from psa_casadi.model.nanopositioner import margins_of as margins_of
 from psa_casadi.model.nanopositioner import nanopositioner as nanopositioner
 from psa_casadi.model.ode_model import ode_model as ode_model
-from psa_casadi.model.own_effects import own_effects as own_effects
 from psa_casadi.model.parts import PARTS as PARTS
 from psa_casadi.model.parts import compensator_for as compensator_for
 from psa_casadi.model.parts import part_model as part_model
@@ -62,6 +61,7 @@ from psa_casadi.model.stacks import stack_model as stack_model
 from psa_casadi.model.system import System as System
 from psa_casadi.model.system import connect as connect
 from psa_casadi.model.table import table as table
+from psa_casadi.model.user_effects import load_effects as load_effects
 from psa_casadi.model.variables import Input as Input
 from psa_casadi.model.variables import Output as Output
 from psa_casadi.model.variables import Parameter as Parameter

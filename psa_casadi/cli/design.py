@@ -136,7 +136,7 @@ def experiment(
 
 def _stacks_effects(inputs: Inputs, wanted: Sequence[str]) -> "list[psa.Component]":
     """Return the effects of a stack to separate; all mistakes are noted."""
-    from psa_casadi.model.own_effects import known_effects
+    from psa_casadi.model.user_effects import known_effects
 
     known = known_effects(inputs.user_effects)
     for name in [n for n in wanted if n not in known]:

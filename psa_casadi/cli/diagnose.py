@@ -218,7 +218,7 @@ def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None
 
 def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":
     """Return the effects to search, without those that --leave-out names."""
-    from psa_casadi.model.own_effects import known_effects
+    from psa_casadi.model.user_effects import known_effects
 
     known = known_effects(inputs.user_effects)
     for name in dict.fromkeys(n for n in left_out if n not in known):

@@ -209,7 +209,7 @@ def _show_start(model: "psa.Model", sets: int | None) -> None:
     from psa_casadi.simulation.start import is_stack
 
     voltage = next((i.start for i in model.structure.inputs if i.name == "voltage"), None)
-    begin = say("command.exported_start", voltage=voltage, own=model.own_starts())
+    begin = say("command.exported_start", voltage=voltage, own=model.changed_starts())
     show(f"start: {begin}")
     if sets is not None:
         evidence = say("command.evidence", model=model, sets=sets, stack=is_stack(model))

@@ -49,7 +49,7 @@ class Inputs:
         self._misfits: list[str] = []
         if not self.effects:
             return
-        from psa_casadi.model.own_effects import declared_effects, misfits
+        from psa_casadi.model.user_effects import declared_effects, misfits
 
         read = [self.attempt(partial(declared_effects, module)) for module in self.effects]
         self.user_effects = [c for result in read for c in (result or {}).values()]

@@ -38,7 +38,7 @@ def effects(
     """
     from psa_casadi.diagnosis.remedy import example, signature
     from psa_casadi.model.effects.mechanics import MODAL_SERIES
-    from psa_casadi.model.own_effects import known_effects
+    from psa_casadi.model.user_effects import known_effects
     from psa_casadi.report.plots.figures import save_signature
     from psa_casadi.report.words.tables import effects_table
     from psa_casadi.report.words.text import effect_page

@@ -105,7 +105,7 @@ def _serve(port: int, no_browser: bool, subject: "Subject", inputs: Inputs) -> N
     """Serve the page until Ctrl-C; its files are removed then."""
     from psa_casadi.cli.workbench.desk import Desk
     from psa_casadi.cli.workbench.server import served
-    from psa_casadi.model.own_effects import known_effects
+    from psa_casadi.model.user_effects import known_effects
 
     modules = inputs.effects or []
     here = str(Path.cwd())  # children look for named modules there, and for nothing else

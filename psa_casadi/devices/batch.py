@@ -46,7 +46,7 @@ from psa_casadi.documents.files import DEVICE_FORMAT as FORMAT
 from psa_casadi.documents.files import DeviceFile, RecordUsed, copied, damage, hash_of
 from psa_casadi.documents.findings import DEVICE_FILE, device_finding, finding_content
 from psa_casadi.model.component import Component
-from psa_casadi.model.own_effects import own_effects
+from psa_casadi.model.user_effects import load_effects
 from psa_casadi.population.population import Finding
 from psa_casadi.version import __version__
 
@@ -246,7 +246,7 @@ def batch(
     """
     began, o = time.monotonic(), options or Options()
     inputs = jobs_given(jobs)
-    effects = [c for module in o.modules for c in own_effects(module).values()]
+    effects = [c for module in o.modules for c in load_effects(module).values()]
     results = Results(Path(output))
     try:
         keys = {job.device: key_of(job, o) for job in inputs}

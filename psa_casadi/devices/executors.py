@@ -28,7 +28,7 @@ from psa_casadi.faces import diagnose, identify
 from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.model.compose import Model
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.model.own_effects import known_effects, own_effects
+from psa_casadi.model.user_effects import known_effects, load_effects
 from psa_casadi.records import Record, read_records, read_signals
 from psa_casadi.records.signals import Signals
 from psa_casadi.simulation.side_by_side import compiled, one_thread
@@ -77,7 +77,7 @@ def stop(run: str) -> None:
 
 def _worked(task: DeviceTask, began: float) -> DeviceOutcome:
     o, job = task.options, task.job
-    effects = [c for module in o.modules for c in own_effects(module).values()]
+    effects = [c for module in o.modules for c in load_effects(module).values()]
     start = loads(o.model, effects=effects) if isinstance(o.model, str) else o.model
     table: dict[str, Any] = {"columns": o.columns, "sample_time": o.sample_time}
     inputs: tuple[Any, ...]
@@ -132,7 +132,7 @@ def make_ready(job: Job, options: Options) -> None:
         start = starting_model(records, options.stiffness)
         models = [start]
         if options.work == "diagnose":
-            effects = [c for module in options.modules for c in own_effects(module).values()]
+            effects = [c for module in options.modules for c in load_effects(module).values()]
             known = known_effects(effects).values()
             models += [start.with_effect(e) for e in known if not e.needs_column]
         compiled(models)

@@ -26,7 +26,7 @@ from psa_casadi.common.errors import InputError, Problems
 from psa_casadi.documents.files import Status, Work
 from psa_casadi.identification.start.ordinary import Hysteresis
 from psa_casadi.model.compose import Model
-from psa_casadi.model.own_effects import declaration_hash
+from psa_casadi.model.user_effects import declaration_hash
 from psa_casadi.records.read.formats import READERS
 from psa_casadi.version import __version__
 

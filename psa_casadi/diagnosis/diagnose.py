@@ -49,7 +49,7 @@ from psa_casadi.identification.start.ordinary import (
 from psa_casadi.identification.start.two_clocks import on_one_clock
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
-from psa_casadi.model.own_effects import known_effects
+from psa_casadi.model.user_effects import known_effects
 from psa_casadi.records.noise_kinds import NoiseFound
 from psa_casadi.records.read.reading import Records, records_given
 from psa_casadi.records.record import Record

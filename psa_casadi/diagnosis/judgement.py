@@ -428,7 +428,7 @@ class Judge:
             "verdict": self.verdict,
             "causes": self.causes,
             "candidates": self.candidates,
-            "missed": self.left(self.first),
+            "base_remaining": self.left(self.first),
             "remaining": self.left(self.final),
             "base_fit": self.first.fit,
             "extended_fit": self.final.fit,

@@ -199,8 +199,8 @@ class Diagnosis(Reported):
 
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
-    effects tried, `errors` those of every measured output. `missed` is what the base leaves,
-    `remaining` what the extended model does. `budget` states where the base's held-out error goes,
+    effects tried, `errors` those of every measured output. `base_remaining` is what the base
+    leaves, `remaining` what the extended model does. `budget` states where the base's held-out error goes,
     `patch` is the unnamed correction that would remove most of what the named causes leave,
     `families` are the places and kinds that this may be of.
     `doubted` states why held-out samples cannot confirm a cause, None where they can; `remarks` are
@@ -211,7 +211,7 @@ class Diagnosis(Reported):
     causes: tuple[Cause, ...]
     candidates: tuple[Candidate, ...]
     errors: tuple[OutputError, ...] = ()
-    missed: Remaining = Remaining(True, 1.0)
+    base_remaining: Remaining = Remaining(True, 1.0)
     remaining: Remaining
     remarks: tuple[Note | str, ...]
     experiments: tuple[Experiment, ...]
@@ -236,8 +236,8 @@ class Diagnosis(Reported):
         result = replace(self, remarks=(*self.remarks, *remarks, *notes), noise_kinds=tuple(noise))
         if not jumps or self.verdict != "adequate":
             return result
-        left = Remaining(False, self.missed.p_value, jumps[0])
-        return replace(result, verdict="unexplained", missed=left, remaining=left)
+        left = Remaining(False, self.base_remaining.p_value, jumps[0])
+        return replace(result, verdict="unexplained", base_remaining=left, remaining=left)
 
     @property
     def doubt(self) -> str:
@@ -335,7 +335,7 @@ class Diagnosis(Reported):
             "causes": [asdict(c) for c in self.causes],
             "candidates": [asdict(c) for c in self.candidates],
             "budget": asdict(self.budget),
-            "missed": with_text(self.missed, "finding", "where"),
+            "missed": with_text(self.base_remaining, "finding", "where"),
             "remaining": with_text(self.remaining, "finding", "where"),
             "unnamed": self.unnamed,
             "families": [asdict(f) for f in self.families],

@@ -196,7 +196,7 @@ class Component:
     `Equations.next` and keeps it up to the next instant. All components of a model share one
     period.
 
-    `home` is the module of a component that is not of this package (`own_effects`). `balances` are
+    `home` is the module of a component that is not of this package (`load_effects`). `balances` are
     further sums that others may add to. `foreign` is what its
     equations call that is no formula; `played` is what is run as a whole in their place.
     """
@@ -255,7 +255,7 @@ class Component:
         function of CasADi.
         """
         if self.home:
-            return _found, ("psa_casadi.model.own_effects", "own_effects", self.home, self.name)
+            return _found, ("psa_casadi.model.user_effects", "load_effects", self.home, self.name)
         for module, table in _TABLES:
             for key, component in getattr(import_module(module), table).items():
                 if component is self:

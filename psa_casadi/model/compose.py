@@ -155,13 +155,13 @@ class Model(Celled):
         structure = structure_of(tuple(components))
         values = {p.name: self.values.get(p.name, p.value) for p in structure.parameters}
         there = {v.name for v in _starting(structure)}
-        kept = {n: v for n, v in self.own_starts().items() if n in there}
+        kept = {n: v for n, v in self.changed_starts().items() if n in there}
         same = _in_plant(self.components) == _in_plant(structure.components)
         evidence = self.evidence.of_parameters(values) if self.evidence and same else None
         changed = replace(self, structure=structure, values=values, evidence=evidence)
         return changed.with_starts(kept)
 
-    def own_starts(self) -> dict[str, float]:
+    def changed_starts(self) -> dict[str, float]:
         """Return the starts of states and inputs that are not those their components declare."""
         declared = {v.name: v.start for c in self.components for v in _starting(c)}
         every = _starting(self.structure)
@@ -170,11 +170,11 @@ class Model(Celled):
     @property
     def starts_itself(self) -> bool:
         """Whether it sets starts of states or of the voltage that its components do not declare."""
-        return not {"voltage", *self.state_names}.isdisjoint(self.own_starts())
+        return not {"voltage", *self.state_names}.isdisjoint(self.changed_starts())
 
     def with_declared_starts(self) -> "Model":
         """Return the model with the start values that its components declare."""
-        values = self.own_starts()
+        values = self.changed_starts()
         return replace(self, structure=structure_of(self.components)) if values else self
 
     def with_starts(self, starts: Mapping[str, float]) -> "Model":

@@ -35,7 +35,7 @@ from psa_casadi.model.own_components import (
     refuse_large,
     written,
 )
-from psa_casadi.model.own_effects import declaration_hash, known_effects
+from psa_casadi.model.user_effects import declaration_hash, known_effects
 from psa_casadi.model.variables import Interval, Parameter, Provenance, Publication
 
 FORMAT = "psa_casadi.model/1"
@@ -100,7 +100,7 @@ def dumps(model: Model) -> str:
     """Return the text of MODEL.json; reading it back gives the same model exactly.
 
     A component that is not of this package has its equations there as text, or the name and the
-    SHA-256 of its FMU; an effect of a module (`own_effects`) is named with that and the hash of
+    SHA-256 of its FMU; an effect of a module (`load_effects`) is named with that and the hash of
     what it declares. Raises InputError for equations that no text can have, two components of
     one name, and numbers and texts that no file can carry.
     """
@@ -114,7 +114,7 @@ def dumps(model: Model) -> str:
         }
         for p in model.structure.parameters
     }
-    starts, stated = model.own_starts(), model.publication.stated
+    starts, stated = model.changed_starts(), model.publication.stated
     content = {
         "format": FORMAT,
         "name": model.name,
@@ -172,7 +172,7 @@ def no_fmu(used: FmuUsed, name: str, parameters: tuple[Parameter, ...]) -> Compo
 
 
 def loads(text: str, source: str = "MODEL.json", effects: Iterable[Component] = ()) -> Model:
-    """Read a model; `effects` are a user's effects that it may have (`own_effects`).
+    """Read a model; `effects` are a user's effects that it may have (`load_effects`).
 
     Raises InputError that names every unknown name, missing or bad value.
     """
@@ -299,7 +299,7 @@ def _unknown(reference: str | OwnEffect, key: str, table: Mapping[str, Component
     module = reference.module[:80]
     return (
         f"has the effect {brief(reference.name)} of the module {module}, which was not named; give"
-        f" --effects {module} (in Python: effects=psa.own_effects({module!r}).values())."
+        f" --effects {module} (in Python: effects=psa.load_effects({module!r}).values())."
     )
 
 

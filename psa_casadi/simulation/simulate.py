@@ -155,14 +155,14 @@ class Trajectory(Plotted, Lined):
     units: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def shown(self) -> str:
+    def sensor_output(self) -> str:
         """The output that the sensor shows; without a sensor, the displacement."""
         return SHOWN[0] if SHOWN[0] in self.outputs else SHOWN[1]
 
     @property
     def displacement(self) -> FloatArray:
         """Displacement that the sensor shows; without a sensor, that of the output [m]."""
-        return self.outputs[self.shown]
+        return self.outputs[self.sensor_output]
 
     def to_frame(self) -> Any:
         """Return time, voltage, states and outputs as a pandas DataFrame: `time [s]`, ..."""

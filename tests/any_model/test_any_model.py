@@ -214,7 +214,7 @@ def test_what_a_user_wrote_is_text_in_the_page(tmp_path: Path) -> None:
         d,
         experiments=(replace(run, record=replace(run.record, name=_HOSTILE)),),
         causes=(replace(cause, description=_HOSTILE),),
-        missed=replace(d.missed, finding=_HOSTILE),
+        base_remaining=replace(d.base_remaining, finding=_HOSTILE),
         remarks=(_HOSTILE,),
     )
     hostile.report(path)

@@ -256,7 +256,7 @@ def test_a_users_effect_is_displayed_simulated_and_saved_by_reference(
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     assert "pickup_gain" in done("effects", "sensor_pickup", "--effects", "pickup_of_mine").out
-    pickup = psa.own_effects("pickup_of_mine")["sensor_pickup"]
+    pickup = psa.load_effects("pickup_of_mine")["sensor_pickup"]
     plain = psa.stack_model(STACK)
     model = plain.with_effect(pickup, {"pickup_gain": 4e-9, "pickup_time": 0.05})
     time = np.linspace(0.0, 0.4, 801)

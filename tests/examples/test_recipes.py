@@ -289,7 +289,7 @@ def test_a_users_effect_is_named_with_the_size_that_was_put_in(
             subprocess.run([sys.executable, *shlex.split(command)[1:]], check=True)
         else:
             run_command(command)
-    components = psa.own_effects("pickup")
+    components = psa.load_effects("pickup")
     monkeypatch.delitem(sys.modules, "pickup")
     values = psa.load_model("extended.json", components.values()).values
     assert values["pickup_gain"] == pytest.approx(4e-9, rel=0.02)

@@ -154,11 +154,11 @@ def test_loops_before_leave_what_the_same_loops_played_leave() -> None:
 
 def test_starts_go_with_a_model_through_its_file_its_plant_and_its_effects() -> None:
     settled = psa.settled_at(STACK, 60.0, [120.0])
-    assert settled.own_starts()["voltage"] == 60.0
+    assert settled.changed_starts()["voltage"] == 60.0
     extended = settled.with_effect(psa.EFFECTS["sensor_lag"], {"sensor_lag_time": 1e-4})
-    assert loads(dumps(extended)).own_starts() == extended.own_starts()
-    assert extended.plant().own_starts() == settled.own_starts()
-    assert STACK.own_starts() == settled.with_declared_starts().own_starts() == {}
+    assert loads(dumps(extended)).changed_starts() == extended.changed_starts()
+    assert extended.plant().changed_starts() == settled.changed_starts()
+    assert STACK.changed_starts() == settled.with_declared_starts().changed_starts() == {}
     assert "starts" not in dumps(STACK)
     with pytest.raises(psa.InputError, match="no state or input 'q'"):
         STACK.with_starts({"q": 1.0})
@@ -174,7 +174,7 @@ def test_a_modelica_package_states_the_same_starts(tmp_path: Path) -> None:
     command = ("export", "modelica", "--stack", "P-885.51", "-o", path)
     done(*command, "--start-voltage", "60", "--history", "120")
     text = path.read_text()
-    starts = psa.settled_at(STACK, 60.0, [120.0]).own_starts()
+    starts = psa.settled_at(STACK, 60.0, [120.0]).changed_starts()
     assert f'Real f_H(unit="N", start={starts["f_H"]!r}, fixed=true' in text
     assert 'input Real voltage(unit="V", start=60.0' in text
     for history, reason in (("120", "--start-voltage"), ("high", "--history is 'high'")):

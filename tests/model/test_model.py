@@ -271,7 +271,7 @@ def test_starts_bounds_and_usual_sizes_come_back() -> None:
         parameters=[psa.Parameter("a", 2.0, "1/s", (0.5, np.inf), "rate", "1/min", log=True)],
     ).with_starts({"x": 1.0 / 3.0})  # fmt: skip
     result = again(model)
-    assert result.own_starts() == {"x": 1.0 / 3.0}
+    assert result.changed_starts() == {"x": 1.0 / 3.0}
     assert result.parameter("a") == model.parameter("a")
     (state,) = result.structure.states
     assert (state.nominal, state.memory, state.settles) == (6.0, True, True)

@@ -18,9 +18,9 @@ import psa_casadi as psa
 from psa_casadi.examples.van_der_pol import model as van_der_pol
 from psa_casadi.export.common.variable_table import variable_table
 from psa_casadi.export.modelica.package import modelica_text
-from psa_casadi.model import own_effects as place
+from psa_casadi.model import user_effects as place
 from psa_casadi.model.model_file import dumps, loads
-from psa_casadi.model.own_effects import declaration_hash, known_effects
+from psa_casadi.model.user_effects import declaration_hash, known_effects
 from tests.export.modelica_runs import load, simulated
 
 SPAN, MU = 10.0, 3.0
@@ -303,12 +303,12 @@ def ripple(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[psa.Comp
     (tmp_path / "gratings.py").write_text(RIPPLE)
     monkeypatch.chdir(tmp_path)
     _forget()
-    yield psa.own_effects("gratings")["encoder_ripple"]
+    yield psa.load_effects("gratings")["encoder_ripple"]
     _forget()
 
 
 def _forget() -> None:
-    psa.own_effects.cache_clear()
+    psa.load_effects.cache_clear()
     place.installed_effects.cache_clear()
     sys.modules.pop("gratings", None)
     sys.modules.pop("rulings", None)
@@ -324,11 +324,11 @@ def test_a_declaration_that_has_changed_is_refused(ripple: psa.Component, tmp_pa
     source = tmp_path / "gratings.py"
     source.write_text("# a comment changes nothing\n" + RIPPLE)
     _forget()
-    commented = psa.own_effects("gratings")["encoder_ripple"]
+    commented = psa.load_effects("gratings")["encoder_ripple"]
     assert declaration_hash(commented) == declaration_hash(ripple)
     source.write_text(RIPPLE.replace("ca.sin", "ca.cos"))
     _forget()
-    other = psa.own_effects("gratings")["encoder_ripple"]
+    other = psa.load_effects("gratings")["encoder_ripple"]
     with pytest.raises(psa.InputError, match="declared in another way"):
         loads(text, effects=[other])
 
@@ -369,7 +369,7 @@ def test_installed_packages_announce_theirs_and_no_neighbour_replaces_one(
     before = list(sys.path)
     assert "encoder_ripple" in known_effects()
     assert len(known_effects()) == len(psa.EFFECTS) + 1
-    assert psa.own_effects("gratings").keys() == {"encoder_ripple"}
+    assert psa.load_effects("gratings").keys() == {"encoder_ripple"}
     assert not list(neighbours.glob("*.ran"))
     assert sys.path == before
 
@@ -382,7 +382,7 @@ def test_a_neighbour_replaces_nothing_that_is_missing(
     with pytest.raises(psa.InputError, match=r"No module named 'gratings'"):
         known_effects()
     assert not list(neighbours.glob("*.ran"))
-    assert "encoder_ripple" in psa.own_effects("gratings")  # by its name
+    assert "encoder_ripple" in psa.load_effects("gratings")  # by its name
     assert (neighbours / "gratings.ran").is_file()
 
 
@@ -402,7 +402,7 @@ def test_a_module_that_does_not_fit_is_refused_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     _forget()
     with pytest.raises(psa.InputError, match=message):
-        psa.own_effects("gratings")
+        psa.load_effects("gratings")
     _forget()
 
 

@@ -129,7 +129,7 @@ def _of_any(d: Diagnosis, series: Sequence[Series]) -> dict[str, Any]:
     return {
         "errors": errors,
         "noise_from": "",
-        "wrong": [[[d.missed.where, *wrong]], []],
+        "wrong": [[[d.base_remaining.where, *wrong]], []],
         **dict.fromkeys(("views", "splits", "signatures"), ()),
     }
 

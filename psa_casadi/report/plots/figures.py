@@ -306,7 +306,7 @@ def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure
         axes = sheet((9.0, 4.5), 100).add_subplot()
     if isinstance(result, Trajectory):
         columns = {"voltage": result.voltage, **result.states, **result.outputs}
-        name = _chosen(output, columns, result.shown)
+        name = _chosen(output, columns, result.sensor_output)
         _curve(axes, result.time, columns[name], name, result.units.get(name, ""))
     elif isinstance(result, Signals):
         name = _chosen(output, result.columns, result.main_column)

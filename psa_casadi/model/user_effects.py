@@ -34,7 +34,7 @@ GROUP = "psa_casadi.effects"
 
 
 @cache
-def own_effects(module: str) -> Mapping[str, Component]:
+def load_effects(module: str) -> Mapping[str, Component]:
     """Return the effects that a named module holds, by name.
 
     It is an installed one, else one of the current folder. The effects are its variables that are a
