@@ -200,8 +200,8 @@ class Diagnosis(Reported):
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
     effects tried, `errors` those of every measured output. `base_remaining` is what the base
-    leaves, `remaining` what the extended model does. `budget` states where the base's held-out error goes,
-    `patch` is the unnamed correction that would remove most of what the named causes leave,
+    leaves, `remaining` what the extended model does. `budget` states where the base's held-out
+    error goes, `patch` is the unnamed correction that removes most of what the named causes leave,
     `families` are the places and kinds that this may be of.
     `doubted` states why held-out samples cannot confirm a cause, None where they can; `remarks` are
     all other notes. `noise_kinds` are those in what the extended model leaves of every output.

@@ -39,7 +39,7 @@ from psa_casadi.report.words.series import (
     telling_window,
     time_scale,
 )
-from psa_casadi.report.words.verdict_words import VERDICTS, verdict_sentence
+from psa_casadi.report.words.verdict_words import VERDICTS
 from psa_casadi.simulation.simulate import Trajectory
 
 Compared = Diagnosis | Identification
@@ -113,8 +113,8 @@ def figure_of(result: Plotted) -> Figure:
 
 def diagnosis_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     """Return the picture of a diagnosis: records, loop, residual and evidence."""
-    verdict = textwrap.wrap(verdict_sentence(diagnosis), 125)
-    figure, grid, worst = _sheet(series_of(diagnosis), origin, "base model", verdict)
+    series = series_of(diagnosis)
+    figure, grid, worst = _sheet(series, origin, "base model", f"{_headline(diagnosis)}; ")
     _draw_residual(figure.add_subplot(grid[1, :2]), worst)
     evidence = figure.add_subplot(grid[1, 2])
     count = len(diagnosis.candidates)
@@ -213,11 +213,11 @@ def response_figure(time: FloatArray, voltage: FloatArray, displacement: FloatAr
 
 
 def _sheet(
-    series: tuple[Series, ...], origin: str, model: str, head: Sequence[str] = ()
+    series: tuple[Series, ...], origin: str, model: str, head: str = ""
 ) -> tuple[Figure, GridSpec, Series]:
     """Return a picture with the record that the `model` misses most, and that record.
 
-    In the upper row are the record, its telling window and its loop, above it the lines of `head`.
+    In the upper row are the record, its telling window and its loop; `head` begins the title.
     """
     s = most_telling(series)
     figure = sheet(SIZE_INCHES, DPI)
@@ -238,8 +238,8 @@ def _sheet(
     draw(loop, records.loop_plot(s, origin, indices), "Loop", legend={"loc": "upper left"})
     which = f"{origin} record: {s.name}"
     if len(series) > 1:
-        which += f" (the one of {len(series)} that the {model} misses most)"
-    figure.suptitle("\n".join([*head, which]), fontsize=FONT + 3)
+        which += f" (of {len(series)}, the largest error of the {model})"
+    figure.suptitle(_one_line(head + which, _TITLE), fontsize=FONT + 3)
     return figure, grid, s
 
 
@@ -291,10 +291,23 @@ def narrow_figure(diagnosis: Diagnosis, *, origin: str = "measured") -> Figure:
     below.set(xlim=(0.0, 1.3 * largest), xticks=[])
     below.invert_yaxis()
     below.spines[["top", "right", "bottom"]].set_visible(False)
+    figure.suptitle(_one_line(_headline(diagnosis), _NARROW), fontsize=font + 2)
+    return figure
+
+
+def _headline(diagnosis: Diagnosis) -> str:
+    """Return the verdict and the causes."""
     causes = phrases.listing([phrases.plain(c.effect) for c in diagnosis.causes])
     verdict = VERDICTS[diagnosis.verdict].capitalize()
-    figure.suptitle(f"{verdict}: {causes}" if causes else verdict, fontsize=font + 2, wrap=True)
-    return figure
+    return f"{verdict}: {causes}" if causes else verdict
+
+
+#: Letters of a title in one line of a picture, and of a narrow one.
+_TITLE, _NARROW = 110, 44
+
+
+def _one_line(title: str, most: int) -> str:
+    return textwrap.shorten(title, most, placeholder=" ...")
 
 
 def one_output(result: Plotted, axes: Axes | None, output: str | None) -> Figure:
@@ -473,9 +486,10 @@ def save_signature(effect: Component, signature: Signature, path: str | os.PathL
     if view.name == "spectrum":
         title = f"Spectrum: {phrases.percent(view.share)} of it in one peak"
     legend: dict[str, str] | None = None if view.name == "spectrum" else {}
-    draw(right, signature_plot(signature), textwrap.fill(title, 48), legend=legend)
-    look = textwrap.fill(f"{phrases.plain(effect.name)}: {effect.looks_like}", 120)
-    figure.suptitle(f"{look}\n{size_sentence(signature)}", fontsize=FONT + 1)
+    draw(right, signature_plot(signature), _one_line(title, 56), legend=legend)
+    size = phrases.with_unit(phrases.number(signature.size), signature.unit)
+    what = f"{phrases.plain(effect.name)}: {signature.stack} with {signature.gain} = {size}"
+    figure.suptitle(_one_line(what, _TITLE), fontsize=FONT + 1)
     write_figure(figure, path)
 
 
