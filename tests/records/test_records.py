@@ -325,9 +325,9 @@ def test_decimal_commas_between_commas_are_not_a_row_too_long(
     tmp_path: Path,
 ) -> None:
     rows = [f"0,00{k},1,5,0,{k}" for k in range(9)]
-    problems = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
-    assert "line 2: found 6 cells, expected 3 as in the header; where numbers have" in problems[0]
-    assert "separate the cells by semicolons" in problems[0]
+    (problem,) = problems_of(write(tmp_path / "a.csv", HEADER, *rows))
+    assert "line 2: found 6 cells, expected 3 as in the header; where numbers have" in problem
+    assert "separate the cells by semicolons" in problem
 
 
 @pytest.mark.parametrize(

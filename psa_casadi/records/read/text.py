@@ -308,12 +308,15 @@ class _Part:
                 spare < 0 and len(cells) <= max(numbers, default=0)
             ):
                 hint = f"complete or remove the {self.place}"
-                if self.layout.delimiter == "," and len(cells) == 2 * width:
+                commas = self.layout.delimiter == "," and len(cells) == 2 * width
+                if commas:
                     hint = "where numbers have decimal commas, separate the cells by semicolons"
                 problems.add(
                     f"{self.path}: {self.place} {line}: found {len(cells)} cells, expected"
                     f" {width} as in the header; {hint}."
                 )
+                if commas:  # so have all rows
+                    problems.raise_if_any()
                 continue
             split.append(cells)
             whole.append(line)
