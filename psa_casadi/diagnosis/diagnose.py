@@ -306,8 +306,9 @@ def diagnose(
         ordered = in_one_order(whole)
         task = Task(table, STACK, method, progress, so_far.append, watch)
         start, experiments, task, scale_given, notes = _prepared(
-            ordered, in_one_order(held), [*cut, *cut_too], task, model, stiffness, hysteresis
-        )
+            ordered, in_one_order(held), [*cut, *cut_too], task, model, stiffness, hysteresis,
+            stuck=stuck_values(model) if model is not None and not since else (),
+        )  # fmt: skip
 
     def diagnosed(method: Method, free: tuple[str, ...] | None) -> StackDiagnosis:
         changed = replace(task, method=method, free=free)
@@ -336,11 +337,13 @@ def _prepared(
     model: Model | None,
     stiffness: float | None,
     hysteresis: Hysteresis | None,
+    *,
+    stuck: tuple[str, ...],
 ) -> tuple[Model, tuple[Experiment, ...], Task, bool, list[Note | str]]:
     """Return where the base fit starts, the experiments, the task, and notes on the records.
 
     And, before these, whether the force scale is known; `kept` are records that are held out, `cut`
-    the notes on their gaps. Raises InputError.
+    the notes on their gaps, `stuck` the model's values on a bound. Raises InputError.
     """
     clean, notes, hidden = _cleaned(records)
     notes += cut
@@ -349,7 +352,7 @@ def _prepared(
         clean, judged = _on_one_clock(clean, notes), _on_one_clock(judged, notes)
     (clean, means), (judged, means_too) = averaged(clean), averaged(judged)
     start, scale_given = chosen_start(clean, model, stiffness)
-    if stuck := stuck_values(start):
+    if stuck:
         values = starting_model(clean, start.values.get("k_B")).values
         start = start.with_values({n: v for n, v in values.items() if n in start.values})
         notes.append(note("stuck_start", names=stuck))

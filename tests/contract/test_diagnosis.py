@@ -246,6 +246,20 @@ def test_what_is_expected_decides_the_exit_code(tmp_path: Path) -> None:
     assert junit(tmp_path / "d.xml") == {"verdict": True, "held-out error": True}
 
 
+def test_a_model_with_a_value_on_its_bound_hides_no_cause(demo: Demo, tmp_path: Path) -> None:
+    """The base fit imitates creep by a damping at its bound; the diagnosis starts elsewhere."""
+    model = demo.folder / "model.json"
+    values = read(model, "model")["parameters"]
+    assert values["c_P"]["value"] == psa.load_model(model).parameter("c_P").bounds[1]
+    done(
+        "diagnose", demo.folder / "synthetic_record.csv", "--model", model, "--quiet", *LEFT_OUT,
+        "--json", tmp_path / "d.json",
+    )  # fmt: skip
+    d = read(tmp_path / "d.json", "diagnosis")
+    assert [c["effect"] for c in d["causes"]] == ["slow_creep"]
+    assert any("c_P" in n and "on a bound" in n for n in d["notes"])
+
+
 def test_held_out_records_only_judge_and_nothing_else_is_written(tmp_path: Path) -> None:
     columns = table(DATA / "demo.csv")
     for name, part in (("a", slice(0, 1200)), ("b", slice(1200, 2000))):
