@@ -71,7 +71,7 @@ def sections() -> Iterator[str]:
     stack = stack_model(STACK).plant()
     yield "## A stack\n\n`psa export fmu --stack NAME` or `--model MODEL.json`; Modelica and C too."
     yield port_table(stack)
-    yield "## A stack with more\n\nThese stand beside the ports above."
+    yield "## A stack with more\n\nThese are added to the ports above."
     yield markdown_table(Table(("with", *_HEAD), tuple(_further(stack))))
     yield "## Parts\n\n`psa export fmu --part NAME`, or `psa.part_model` with your values."
     for name, kind in PARTS.items():

@@ -131,7 +131,7 @@ def test_causes_that_cancel_each_other_are_reported() -> None:
 
 
 #: Tests that share a diagnosis run in one process.
-shares_hysteresis = pytest.mark.xdist_group("own hysteresis")
+shares_hysteresis = pytest.mark.xdist_group("oscillator hysteresis")
 _HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
 
 
@@ -286,7 +286,7 @@ def test_dry_friction_of_a_motor_is_detected_at_its_shaft(
 @pytest.mark.slow
 @shares_hysteresis
 def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
-    """Golden answers (own/breathing) have the same verdict by all kinds of effects."""
+    """The golden answer of `breathing` has the same verdict with all kinds of effects."""
     few = ["hysteresis", "stop", "curve"]
     d = psa.diagnose(oscillator(), plants.breathing(4), leave_out=few)
     assert d.verdict == "unexplained"

@@ -22,7 +22,9 @@ from tests.studies.benchmarks.hidden_cases import Case, CaseResult
 NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 
 
-def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> CaseResult:
+def _case_result(
+    effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1
+) -> CaseResult:
     case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
     verdict: Verdict = "cause_named" if named else "unexplained"
     return CaseResult(case, 1.0, verdict, named, named, (), {}, 1.0)
@@ -30,8 +32,8 @@ def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int =
 
 def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
     """Without the finite steps all three effects are taken for backlash; nothing else changes."""
-    whole = [_found(n, (n,)) for n in NAMES]
-    whole.append(replace(_found("dry_friction", (), "foreign", 9), patched=0.75))
+    whole = [_case_result(n, (n,)) for n in NAMES]
+    whole.append(replace(_case_result("dry_friction", (), "foreign", 9), patched=0.75))
     worse = [replace(f, named=("backlash",), within=("backlash",)) for f in whole[:3]]
     methods: list[Method] = []
 

@@ -98,7 +98,7 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
 def test_a_function_of_casadi_is_an_ode_too() -> None:
     x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
     rates = ca.vertcat(x[1], u - k * x[0])
-    function = ca.Function("given", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
+    function = ca.Function("rates", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
     model = psa.ode_model(function, name="spring", parameters=["k"], values={"k": 4.0})
     assert model.state_names == ("x_0", "x_1")
     assert model.output_names == ("x_0_out", "x_1_out")

@@ -81,8 +81,8 @@ def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool 
     """
     copy = page.with_name(f"{page.stem}-driven.html")  # in the same folder: its links are relative
     call = (
-        "<pre id='driven'></pre><script>function tell(found) {"
-        " document.getElementById('driven').textContent = JSON.stringify(found); }\n"
+        "<pre id='driven'></pre><script>function tell(result) {"
+        " document.getElementById('driven').textContent = JSON.stringify(result); }\n"
         f"window.addEventListener('load', () => setTimeout(() => {{\n{script}}}, 500));"
         "</script></body>"
     )
@@ -122,7 +122,7 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     return outer
 
 
-def seen_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
+def phone_view(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
     """Return how a page came out on a phone."""
     hear = "addEventListener('message', function (e) { tell(JSON.parse(e.data)); });"
     table: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)

@@ -230,7 +230,7 @@ def test_texts_are_as_they_were_accepted(name: str) -> None:
     accepted = place(name).read_text("utf-8").splitlines()
     texts = lines_now(name)
     if len(texts) != len(accepted) or not all(map(is_same, texts, accepted)):
-        change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "found", lineterm=""))
+        change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "now", lineterm=""))
         pytest.fail(f"{change}\nIf this is meant: python -m tests.report.test_told")
 
 

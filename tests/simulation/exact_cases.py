@@ -41,7 +41,7 @@ FEEDBACK = psa.Component(
 )
 KINK = psa.Component(
     name="kink",
-    description="a stop with a switch of its own",
+    description="a stop with a switch",
     source="test",
     equations=lambda s: psa.Equations(
         add={"tip_force": -1e6 * ca.fmax(0, s.x - 3e-6)}, switches={"contact": s.x - 3e-6}

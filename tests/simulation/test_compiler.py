@@ -113,10 +113,10 @@ def test_without_zig_the_host_compiler_is_used(
         commands.append(command)
         (directory / command[-1]).write_bytes(b"binary")
 
-    monkeypatch.setenv("CC", "own-cc")
+    monkeypatch.setenv("CC", "user-cc")
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
     assert compile_library({"model.c": "int a;"}, "psa", host()) == b"binary"
-    assert commands[0][0] == "own-cc"
+    assert commands[0][0] == "user-cc"
     assert "-target" not in commands[0]
 
 

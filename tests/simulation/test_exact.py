@@ -372,8 +372,8 @@ CODE = """
     __attribute__((visibility("default"))) void each_##name(long n, const double *x, double *y) { \\
         for (long i = 0; i < n; ++i) {                                                            \\
             const real z = x[i] + REAL(0.0);                                                      \\
-            const real found = name(z);                                                           \\
-            y[i] = LANE(found, PSA_LANES - 1);                                                    \\
+            const real value = name(z);                                                           \\
+            y[i] = LANE(value, PSA_LANES - 1);                                                    \\
         }                                                                                         \\
     }
 EACH(v_exp)

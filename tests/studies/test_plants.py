@@ -136,7 +136,7 @@ def test_effect_vanishes_at_gain_zero_and_adds_what_it_did(effect: HiddenEffect,
     assert np.ptp(added) > 1e6 * np.ptp(part.displacement)
     figures = [np.sqrt(np.mean(added**2)), added.min(), added.max(), added[-1]]
     line = "\t".join([effect.name, *(f"{x:.7g}" for x in figures)])
-    text = f"Add this line to {KEPT.name}, or what it says now is another plant: {line}"
+    text = f"Add this line to {KEPT.name}, or its present line is of another plant: {line}"
     assert effect.name in ADDED, text
     np.testing.assert_allclose(figures, ADDED[effect.name], rtol=1e-5, atol=1e-6, err_msg=text)
 

@@ -262,7 +262,7 @@ def summary(cases: Sequence[Added]) -> TitledTable:
 
     def row(figure: str, target: str, holds: Callable[[Added, int], bool]) -> Row:
         shares = {way: share(holds(f, k) for f in new) for k, way in enumerate(_WAYS)}
-        return {"figure": figure, "asked": target, **shares}
+        return {"figure": figure, "target": target, **shares}
 
     def wrong(f: Added, way: int) -> set[str]:
         """Return the wrong names; without a reference the record's causes are right too."""
@@ -282,10 +282,10 @@ def summary(cases: Sequence[Added]) -> TitledTable:
             ),
             row("a single wrong name", "at most 2 %", single_wrong),
             row("any cause that is not there", "-", lambda f, k: bool(wrong(f, k))),
-            row("said to be as it was", "-", lambda f, k: f.answers[k].verdict == "adequate"),
+            row("verdict: no change", "-", lambda f, k: f.answers[k].verdict == "adequate"),
         ],
         f"{len(cases) - len(new)} of {len(cases)} effects are named in the record without them and"
-        f" do not count. The added rms, beside what the base can absorb, is {SIZE:g} times the"
+        f" do not count. The added rms, without what the base can absorb, is {SIZE:g} times the"
         f" residual of the record's extended model. Every {TUNED}rd case, on which the constants"
         " were chosen, is not counted.",
     )

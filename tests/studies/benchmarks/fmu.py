@@ -254,7 +254,7 @@ def _measured(
 
 def _table(case: Case, runs: Sequence[Run], doubt: float) -> TitledTable:
     rows = [
-        {"method": r.method, "tolerance asked for": f"{r.tolerance:.0e}",
+        {"method": r.method, "required tolerance": f"{r.tolerance:.0e}",
          "largest error / range": number(r.error, 2),
          "error / tolerance": number(r.error / r.tolerance, 2),
          "CPU time [ms]": number(1e3 * r.seconds), "right-hand sides": number(r.evaluations)}
@@ -343,6 +343,6 @@ def cost_table(repetitions: int) -> TitledTable:
     return TitledTable(
         f"Cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
         rows,
-        f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
+        f"Target for the generated code: at most {MOST_NS:g} ns, worst over mean below"
         f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
     )

@@ -151,7 +151,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         "Off: distance from the truth in standard errors. Cost: half the sum of squares over the"
         " noise, ours over the peer's."
     )
-    tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", result, note)]
+    tables = [TitledTable("Parameters of FMUs, compared with SciPy's least_squares", result, note)]
     if hidden:
         tables.append(TitledTable("What hides around them", hidden))
     if not only:

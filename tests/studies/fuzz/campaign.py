@@ -248,7 +248,7 @@ class _Worker:
                 raise RuntimeError(f"the harness failed at {self.block.target.name}:\n{value}")
             case float():
                 self.seconds, self.whole, self.index = value, True, self.block.first + self.done
-            case int() if what == "begins":
+            case int() if what == "start":
                 self.index, self.since = value, time.monotonic()
             case int():
                 self.done, self.accepted = self.done + 1, self.accepted + value
@@ -307,7 +307,7 @@ def _attack_all(
     for index in range(block.first, block.last):
         if (time.monotonic() > until and not block.alone) or os.getppid() != parent:
             break
-        connection.send(("begins", index))
+        connection.send(("start", index))
         data = target.make(generator(seed, target.name, index))
         work.mkdir(exist_ok=True)
         accepted = False

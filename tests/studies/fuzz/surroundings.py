@@ -21,8 +21,8 @@ from tests.studies.fuzz.commands import (
     WORKS,
     Around,
     environment,
-    given_files,
     half_written,
+    input_files,
     left_files,
     misbehaved,
     place,
@@ -220,7 +220,7 @@ def _surround(data: bytes, where: Path) -> Iterator[Finding]:
             around.first()
 
         target = folder / chosen.name if chosen.output else folder
-        places = {n: folder / n for n in given_files()} | {n: target / n for n in work.outputs}
+        places = {n: folder / n for n in input_files()} | {n: target / n for n in work.outputs}
         named = [places.get(a, a) for a in work.arguments]  # whole paths: the folder may be gone
         what = f"{case['surroundings']}: psa {case['run']}"
         ended = psa(named, folder, replace(around, first=first))
@@ -250,7 +250,7 @@ def _many(data: bytes, where: Path) -> Iterator[Finding]:
         for process in running:
             _, err = process.communicate()
             if process.returncode:
-                yield Finding(WRONG_EXIT, f"{what}: one says {err.decode()[-200:]}")
+                yield Finding(WRONG_EXIT, f"{what}: the error of one is {err.decode()[-200:]}")
         if (n := len({(folder / f"{k}.csv").read_bytes() for k in range(count)})) != 1:
             yield Finding(WRONG_EXIT, f"{what} give {n} results")
         if left := [p.name for p in (folder / "cache" / "models").iterdir() if p.is_dir()]:
@@ -259,7 +259,7 @@ def _many(data: bytes, where: Path) -> Iterator[Finding]:
 
 TARGETS = (
     Target("environments", "environments", ".json", _surroundings_case, _surround, 5.0,
-           2 * LIMIT_S, None, given_files),
+           2 * LIMIT_S, None, input_files),
     Target("many-at-once", "environments", ".json", lambda _: b'{"commands": 20}', _many, 1.0,
-           2 * LIMIT_S, None, given_files),
+           2 * LIMIT_S, None, input_files),
 )  # fmt: skip

@@ -205,7 +205,7 @@ def _asks() -> Iterator[tuple[str, str, str, Ask]]:
 ASKS = {f"{kind}/{name}": ask for kind, name, _, ask in _asks()}
 
 
-def _asked(ask: Ask, folder: Path) -> Row:
+def _examined(ask: Ask, folder: Path) -> Row:
     return diagnosed(*ask(folder, 0))
 
 
@@ -259,7 +259,7 @@ def _own(name: str, folder: Path) -> Row:
 
 def _identified(folder: Path) -> Row:
     """Return which parameters of a sound stack `psa identify` determines, with intervals."""
-    record, file = folder / "record.csv", folder / "found.json"
+    record, file = folder / "record.csv", folder / "identification.json"
     make_record(None, 990101, record, excitation="loops", visible=None)
     done("identify", record, "--json", file, "--quiet")
     content = json.loads(file.read_text("utf-8"))
@@ -276,7 +276,7 @@ def _identified(folder: Path) -> Row:
 
 def _all() -> Iterator[Case]:
     for kind, name, hidden, ask in _asks():
-        yield Case(kind, name, hidden, partial(_asked, ask))
+        yield Case(kind, name, hidden, partial(_examined, ask))
     for name, (fitted, held) in _MEASURED.items():
         yield Case("measured", name, "-", partial(_measured, fitted, held))
     for name, (hidden, *_) in _OWN.items():
