@@ -93,7 +93,7 @@ def port_table(model: Model) -> str:
 
 
 def _rows(inputs: Iterable[Input], outputs: Iterable[Output]) -> Iterator[tuple[str, ...]]:
-    """Yield the row of each port; an estimate has the sign of what it estimates."""
+    """Yield the row of each port; an estimate has the sign of its quantity."""
     ports: list[tuple[str, str, Input | Output]] = []
     ports += [("in", number(p.start, 5), p) for p in inputs]
     ports += [("out", "follows", q) for q in outputs]

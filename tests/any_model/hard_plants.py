@@ -75,7 +75,7 @@ def duffing() -> Plant:
 
 
 def slide() -> Plant:
-    """A slide on a guide with dry friction and a slope, of which nothing pulls it back."""
+    """A slide on a guide with dry friction and a slope, and no restoring force."""
     rng, t = np.random.default_rng(5), 0.01 * np.arange(1500, dtype=np.float64)
     wanted = 0.1 * np.sin(2 * np.pi * 0.35 * t) + 0.05 * np.sin(2 * np.pi * 0.9 * t + 1.0)
     force, x = np.zeros(t.size), np.zeros((t.size, 2))
@@ -106,7 +106,7 @@ def _log(name: str, value: float) -> psa.Parameter:
 
 
 def spring() -> psa.Model:
-    """Return a mass on a spring, as it was when new."""
+    """Return a mass on a spring before ageing."""
     x, v, u, k, c = (ca.SX.sym(n) for n in ("x", "v", "u", "k", "c"))
     return psa.ode_model(
         {"x": [x, v], "u": u, "p": [k, c], "ode": [v, u - k * x - c * v], "y": x},

@@ -383,7 +383,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
 def test_the_help_of_both_faces_mentions_user_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
         assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
-        assert str(face.__doc__).count(word) >= 2  # in the signature and in words
+        assert str(face.__doc__).count(word) >= 2  # in the signature and in the text
 
 
 def test_records_that_do_not_fit_are_refused_in_sentences() -> None:

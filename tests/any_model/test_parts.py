@@ -90,7 +90,7 @@ def test_what_is_missing_in_an_unstable_plant_is_named() -> None:
 
 @pytest.mark.slow
 def test_what_an_integrator_lacks_is_named_and_judged_on_the_whole_record() -> None:
-    """A slide on a guide with dry friction and a slope, of which nothing pulls it back."""
+    """A slide on a guide with dry friction and a slope, and no restoring force."""
     model, record, truth = hard.slide()
     d = psa.diagnose(model, record)
     assert {c.effect for c in d.causes} == {"friction_in_v", "constant_in_v"}

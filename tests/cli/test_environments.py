@@ -20,7 +20,7 @@ from tests.records.record_files import write
 from tests.tiers import posix, slow_but
 
 FAULT = "This is a fault of psa_casadi"
-#: A locale that knows ASCII alone, which Python does not replace by UTF-8.
+#: A locale of ASCII alone, which Python does not replace by UTF-8.
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 

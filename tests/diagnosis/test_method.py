@@ -1,4 +1,4 @@
-"""What a step of the method and its constants are good for is counted, and constants decide."""
+"""The ablation counts the effect of each step and constant of the method."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -25,7 +25,7 @@ NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 def _case_result(
     effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1
 ) -> CaseResult:
-    case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
+    case = Case(kind, effect, seed)  # type: ignore[arg-type]  # all kinds below are valid
     verdict: Verdict = "cause_named" if named else "unexplained"
     return CaseResult(case, 1.0, verdict, named, named, (), {}, 1.0)
 

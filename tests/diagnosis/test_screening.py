@@ -81,7 +81,7 @@ def _size_test(
 
 
 def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> None:
-    """What a colour swallows of a misfit is larger where the misfit is."""
+    """Noise whose size follows the reversals is significant unless the colour is the residual's."""
     quiet = [_size_test(noise(0.0, seed)) for seed in range(20)]
     assert min(quiet) > 1e-3
     after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
@@ -108,7 +108,7 @@ def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
 
 
 def test_slow_waves_are_no_evidence_next_to_a_random_walk() -> None:
-    """White noise would speak for them with hundreds of nats."""
+    """With white noise the evidence for them would be hundreds of nats."""
     walk = np.cumsum(np.random.default_rng(3).standard_normal(N))
     waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, N), np.arange(8)))
     left = [walk - w @ np.linalg.lstsq(w, walk, rcond=None)[0] for w in (waves[:, :4], waves)]

@@ -1,4 +1,4 @@
-"""Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and what is refused in words."""
+"""Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and refused inputs."""
 
 import importlib
 import math
@@ -205,7 +205,7 @@ def _solved() -> dict[str, Any]:
     return {"x": u, "ode": root(x0=0.0, p=u)["x"]}
 
 
-#: What is wrong, the inputs, words of the sentence.
+#: The fault, the inputs, a part of the message.
 WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "unknown symbol": (lambda: {"x": X, "ode": K * X}, {}, "'ode' uses the symbol 'k'"),
     "unknown symbol in y": (lambda: {"x": X, "ode": X, "y": K}, {}, "'y' uses the symbol 'k'"),

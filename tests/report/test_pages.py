@@ -48,7 +48,7 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     held = re.findall(r'<script type="application/gzip" id="(\w+)">(.*?)</script>', text)
     assert [name for name, _ in held] == ["arrays", "library"]
     arrays, library = (gzip.decompress(base64.b64decode(data)).decode() for _, data in held)
-    assert library == get_plotlyjs()  # speaks what the installed plotly writes
+    assert library == get_plotlyjs()  # the version of the installed plotly
     rows = arrays.split(" ")
     assert len(rows) == len(set(rows))
     long = [row for row in rows if len(row) == 1500 * 4 * 4 // 3]

@@ -13,7 +13,7 @@ from tests.model.stack_models import at_ordinary_size, stack
 OUTPUT = "measured_displacement"
 #: Five voltages over rated voltage, as functions of the share of the record.
 VOLTAGES = ("sine", "triangle", "steps", "multisine", "ramps")
-#: The components below are known to no list of names.
+#: No list of names contains the components below.
 LAG = psa.Component(
     name="second_lag",
     description="the voltage follows through one more lag",

@@ -1,4 +1,4 @@
-"""Which C compiler is used, the message without one, and the cache of what it makes."""
+"""Which C compiler is used, the message without one, and the cache of its results."""
 
 import ctypes
 import errno
@@ -159,7 +159,7 @@ def checksum(path: Path) -> Path:
 
 
 def rewrite(path: Path, content: bytes) -> None:
-    """Write another file of the name; the one that is loaded in this process stays."""
+    """Write another file of the name; the loaded library stays in this process."""
     path.unlink()
     path.write_bytes(content)
     path.chmod(0o700)

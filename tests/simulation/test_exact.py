@@ -214,7 +214,7 @@ def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
     assert np.max(np.abs(rough - fine)) <= 1e-5 * np.ptp(fine)
 
 
-#: Force that the hysteresis softens: what it multiplies lies in a loop.
+#: Force that the hysteresis softens: its factor is in a loop.
 SOFTER = psa.Component(
     name="softer",
     description="a spring that the hysteresis softens",

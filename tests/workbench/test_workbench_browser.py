@@ -32,7 +32,7 @@ def drop(tab: Steered, path: Path) -> None:
 
 
 def faults(tab: Steered, axe: str) -> list[str]:
-    """Return what axe calls serious or critical in the page as it is now."""
+    """Return the violations in the present page that axe rates serious or critical."""
     tab.run(f"{axe}; window.violations = null; axe.run({{resultTypes: ['violations']}}).then("
             "r => { window.violations = r.violations; }); 0")  # fmt: skip
     tab.until("window.violations")

@@ -239,7 +239,7 @@ def cases(quick: bool) -> tuple[Case, Case]:
 def _measured(
     name: str, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray, repeats: int
 ) -> Run:
-    """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
+    """Return one run with the least CPU time of its repeats; a slow run has one."""
     runs: list[Solved] = []
     work = partial(METHODS[name], case, fmu, tolerance)
     try:

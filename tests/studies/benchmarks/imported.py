@@ -160,7 +160,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
 
 
 def _held() -> list[Row]:
-    """Return how long fmpy takes with an FMU, and with one that holds it; and how far it is off."""
+    """Return fmpy's time with an FMU and with one that contains it, and the error."""
     held = psa.export_extended(with_effects(), Path(_FOLDER.name) / "held.fmu")
     rows, points = list[Row](), np.linspace(0.0, 100.0, 2001)
     flow = np.interp(points, TIMES, INFLOW)

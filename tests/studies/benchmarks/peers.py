@@ -306,7 +306,7 @@ def ensembles(progress: Progress, quick: bool, size: int = SETS) -> Outcome:
 
 
 def cases(samples: int) -> list[psa.Record]:
-    """Return a slow sine, of which a sample is one step, and a multisine that turns often."""
+    """Return a slow sine, one step a sample, and a multisine with many reversals."""
     t = time_grid(samples * SAMPLE_TIME, SAMPLE_TIME)[:samples]
     part = multisine(t[:_PART], 0.0, 100.0, (10.0, 250.0), seed=1)
     voltages = {

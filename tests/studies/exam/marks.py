@@ -34,7 +34,7 @@ HYSTERESIS = frozenset(
         "saturation_of_strain",
     }
 )
-#: A wrong name is sure from this probability on.
+#: A wrong name counts as confident from this probability on.
 SURE = 0.9
 ALARM, HONEST = "alarm on clean", "unexplained (honest)"
 ADEQUATE, HYSTERESIS_FOUND = "right (adequate)", "right (hysteresis)"
@@ -47,7 +47,7 @@ WRONG, SURELY = "wrong name", ", 90 % or more"
 
 @dataclass(frozen=True)
 class Question:
-    """What is right to say of a record.
+    """The right answers for a record.
 
     Its group; the accepted names of each hidden cause, of a foreign or clean record what comes
     nearest; whether its hysteresis is not Bouc-Wen's; its noise where that is not white.

@@ -42,7 +42,7 @@ class Finding(NamedTuple):
 
 
 class Draw(Random):
-    """A generator of random numbers that knows the turn of its input, to go through a table."""
+    """A random number generator with the index of its input, to go through a table."""
 
     turn: int = 0
 
@@ -108,7 +108,7 @@ class Tally:
 
 
 class _Block(NamedTuple):
-    """Inputs `first` up to `last` of a target; `alone` is one that seemed to hang, tried again."""
+    """Inputs `first` up to `last` of a target; `alone` repeats one that seemed to hang."""
 
     target: Target
     first: int
@@ -264,7 +264,7 @@ class _Worker:
         self.failures.append(Failure(name, kind, sentence, self.index, sentence, trace))
 
     def clean(self) -> None:
-        """End the process and remove what it left, which is counted already."""
+        """End the process and remove its files, which are already counted."""
         self._process.kill()
         self._process.join()
         for folder, _, _ in os.walk(self.folder):

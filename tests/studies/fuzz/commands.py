@@ -277,7 +277,7 @@ _CODES = {"SIGTERM": (0, 143), "SIGINT": (0, 130), "SIGKILL": (0, -9), "SIGHUP":
 
 @cache
 def _slowness() -> float:
-    """Return how much longer this machine takes now than one that does nothing else."""
+    """Return the present slowdown of this machine, relative to an idle one."""
     begin = time.monotonic()
     input_files()
     return (time.monotonic() - begin) / 3.0

@@ -67,7 +67,7 @@ _HEADER = ["time [s]", "voltage [V]", "displacement [um]"]
 
 @cache
 def sound_files() -> dict[str, tuple[bytes, ...]]:
-    """Return files that are read as they are, by their ending."""
+    """Return files that are read unchanged, by their extension."""
     rows: list[list[float]] = np.column_stack([_T, _U, _Y]).tolist()
     stated = {"Voltage": {"unit_string": "V"}, "Position": {"unit_string": "um"}}
     waves = {n: {**u, "wf_increment": 0.125} for n, u in stated.items()}

@@ -29,7 +29,7 @@ from tests.studies.fuzz.commands import (
     psa,
 )
 
-#: Of Linux's prctl: take a right away, such as what lets root write anywhere.
+#: Of Linux's prctl: drop a capability, such as root's to write anywhere.
 _DROP, _RIGHTS = 24, (1, 2, 3, 24)
 #: A cache in its usual place, below the folder of the user.
 _USUAL = {
@@ -40,7 +40,7 @@ _USUAL = {
 
 @dataclass(frozen=True)
 class Odd:
-    """Odd surroundings: how they are made, and words of which a failure must say one, lower case.
+    """Unusual surroundings: their set-up, and words of which a failure's message has one.
 
     Without `words` the command must work. The command runs as a user who may not do everything.
     `place` is made in the command's folder, `variable` names it, and `output` is written there;

@@ -35,7 +35,7 @@ from tests.studies.plants.table import FOREIGN, KNOWN, called
 SHARES = {"known": 0.5, "clean": 0.2, "foreign": 0.1, "weak": 0.1, "two": 0.1}
 #: The base model absorbs a lag of the sensor: no gain makes it visible.
 VISIBLE = tuple(name for name in KNOWN if name != "sensor_lag")
-#: Drawn relative to their record (`in_terms_of`), which knows the first effect only.
+#: Drawn relative to their record (`in_terms_of`), which has the first effect only.
 _FIRST_ONLY = ("offset_drift", "self_heating", "voltage_saturation")
 #: Draws of one effect before the next one takes its place.
 _ATTEMPTS = 3
