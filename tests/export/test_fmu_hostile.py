@@ -236,9 +236,7 @@ def _named(*names: str) -> Change:
     def add(archive: zipfile.ZipFile) -> None:
         for name in names:
             entry = zipfile.ZipInfo("x")
-            entry.filename = entry.orig_filename = (
-                name  # unchanged, with characters that ZipInfo would replace
-            )
+            entry.filename = entry.orig_filename = name  # ZipInfo would clean it
             archive.writestr(entry, b"text")
 
     return add
