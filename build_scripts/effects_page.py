@@ -88,7 +88,7 @@ def of_any_model() -> Table:
 
 @cache
 def picture(name: str) -> tuple[bytes, str]:
-    """Return the picture of an effect's signature as PNG, and on what it is simulated."""
+    """Return the picture of an effect's signature as PNG, and a sentence on its record."""
     effect = EFFECTS[name]
     observed = signature(effect)
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def picture(name: str) -> tuple[bytes, str]:
 
 
 def section(effect: Component) -> str:
-    """Return one effect in Markdown: what it is, equation, signature, what now, parameters."""
+    """Return one effect in Markdown: description, equation, signature, remedy, parameters."""
     size, (remedy, record) = effect_size(effect, *example(effect)), effect_advice(effect)
     parts = [
         f"### `{effect.name}`",

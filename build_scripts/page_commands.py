@@ -135,16 +135,16 @@ def run_block(block: Block, directory: Path) -> str | None:
                 check=False,
             )
         except subprocess.TimeoutExpired as ended:
-            _tell(command, ended.stdout, f"ended after {LIMIT_S} s")
+            _print_whole(command, ended.stdout, f"ended after {LIMIT_S} s")
             return f"{block.place}: '{command}' ran longer than {LIMIT_S} s."
         code, took = done.returncode, time.monotonic() - started
-        _tell(command, done.stdout, f"exit code {code}, {took:.1f} s")
+        _print_whole(command, done.stdout, f"exit code {code}, {took:.1f} s")
         if code != 0:
             return f"{block.place}: '{command}' ended with exit code {code}."
     return None
 
 
-def _tell(command: str, data: bytes | None, end: str) -> None:
+def _print_whole(command: str, data: bytes | None, end: str) -> None:
     """Print a command and its output at once, so that two do not mix."""
     text = (data or b"").decode("utf-8", "replace")
     print(f"$ {command.partition(chr(10))[0]}\n{text}  [{end}]\n", end="", flush=True)

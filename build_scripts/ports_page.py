@@ -71,7 +71,7 @@ def sections() -> Iterator[str]:
     stack = stack_model(STACK).plant()
     yield "## A stack\n\n`psa export fmu --stack NAME` or `--model MODEL.json`; Modelica and C too."
     yield port_table(stack)
-    yield "## A stack with more\n\nThese stand beside the ports above."
+    yield "## A stack with more\n\nThese are added to the ports above."
     yield markdown_table(Table(("with", *_HEAD), tuple(_further(stack))))
     yield "## Parts\n\n`psa export fmu --part NAME`, or `psa.part_model` with your values."
     for name, kind in PARTS.items():
@@ -93,7 +93,7 @@ def port_table(model: Model) -> str:
 
 
 def _rows(inputs: Iterable[Input], outputs: Iterable[Output]) -> Iterator[tuple[str, ...]]:
-    """Yield the row of each port; an estimate has the sign of what it estimates."""
+    """Yield the row of each port; an estimate has the sign of its quantity."""
     ports: list[tuple[str, str, Input | Output]] = []
     ports += [("in", number(p.start, 5), p) for p in inputs]
     ports += [("out", "follows", q) for q in outputs]

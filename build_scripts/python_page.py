@@ -30,9 +30,9 @@ SECTIONS = {
         design.quickest_move design.AmplifierLimits design_mechanism mechanism_model port_model""",
     "Errors": "PsaError InputError MachineError __version__",
 }
-#: Spaces whose names stand under the headings above; of `datasets` all are on the page.
+#: Namespaces whose names are under the headings above; of `datasets` all are on the page.
 SPACES = ("design", "online", "system")
-#: Where the words of a name are that is made when the package runs.
+#: Where the docstring of a name is that is made at run time.
 _ELSEWHERE = {
     "identify": ("identification.identify.identify", "identification.own_model.identify_ode"),
     "diagnose": ("diagnosis.diagnose.diagnose", "diagnosis.ode.diagnose_ode"),

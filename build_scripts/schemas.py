@@ -32,7 +32,7 @@ FILES: dict[str, type] = {
 
 
 def schema_texts() -> dict[str, str]:
-    """Return the schemas as they are shipped, by the names of their files."""
+    """Return the shipped schemas by file name."""
     return {f"{name}.schema.json": json_text(json_schema(file)) for name, file in FILES.items()}
 
 

@@ -57,7 +57,7 @@ def section(name: str, schema: Schema) -> str:
 
 
 def kind(name: str, schema: Schema) -> str:
-    """Return what a value may be, in words; records link to where they are described."""
+    """Return the allowed values in words; records link to their description."""
     if "$ref" in schema:
         record = schema["$ref"].rpartition("/")[2]
         return f"[{record}](#{_anchor(name, record)})"

@@ -23,7 +23,7 @@ FOLDER = "tutorials"
 LIMIT_S = 600
 
 _TITLE = re.compile(r"\A# .*\n")
-#: A heading, or a picture that has no words yet.
+#: A heading, or a picture that has no alternative text yet.
 _HEADING_OR_PICTURE = re.compile(r"^#+ (?P<heading>.*)$|!\[(?:png|svg)\]\(", re.MULTILINE)
 
 

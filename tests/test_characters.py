@@ -115,11 +115,11 @@ def test_what_a_terminal_would_obey_is_spelled_out() -> None:
 
 @pytest.mark.parametrize("name", ["identify", "diagnose", "check"])
 def test_no_name_of_a_file_or_a_column_reaches_the_terminal_raw(name: str, tmp_path: Path) -> None:
-    path = write(tmp_path / "\x1b]0;own\x07.csv", "t\x1b[31m [s],U\x9b2J,\u202ex", *ROWS)
+    path = write(tmp_path / "\x1b]0;title\x07.csv", "t\x1b[31m [s],U\x9b2J,\u202ex", *ROWS)
     written = () if name == "check" else ("-o", tmp_path / "m.json")
     report = command(name, path, *written)
     assert report.code == 2
-    assert "\\x1b]0;own\\x07.csv" in report.err
+    assert "\\x1b]0;title\\x07.csv" in report.err
     assert all(c.isprintable() or c == "\n" for c in report.out + report.err)
 
 

@@ -289,7 +289,7 @@ def test_requests_to_end_are_answered_in_the_block_alone(
 
 
 def runs(pid: int) -> bool:
-    """Whether a process is there, and no one that has ended and is not waited for."""
+    """Whether a process runs; a zombie does not count."""
     state = Path(f"/proc/{pid}/stat")
     try:
         os.kill(pid, 0)

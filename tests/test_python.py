@@ -1,4 +1,4 @@
-"""The public names: few to begin with, the others where they belong; a model in CasADi's words."""
+"""The public names: few at the top level, the others in modules; a model as CasADi functions."""
 
 import ast
 import inspect
@@ -247,7 +247,7 @@ def _lag() -> psa.Model:
     return psa.ode_model({"x": x, "u": u, "ode": u - x}, name="lag")
 
 
-#: By public class: an example, and what it answers.
+#: By public class: an example, and its text.
 EXAMPLES: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {
     "Model": (stack, driven),
     "System": (lambda: psa.nanopositioner("P-885.51"), lambda s: driven(s.model())),

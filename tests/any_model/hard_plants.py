@@ -40,14 +40,14 @@ def pendulum(drag: float = 0.0, seed: int = 0) -> Plant:
     model = psa.ode_model(
         {"x": [a, w], "u": u, "p": p, "ode": [w, rate], "y": a},
         name="pendulum",
-        outputs=["shown"],
+        outputs=["measured"],
         parameters=[
             psa.Parameter("a", 15.0, "1", (1.0, 200.0), "g over length", log=True),
             psa.Parameter("J", 0.1, "1", (0.005, 1.0), "inertia", log=True),
             psa.Parameter("b", 0.1, "1", (1e-3, 3.0), "damping", log=True),
         ],
     )
-    return model, {"time": t, "torque": torque, "shown": angle}, truth
+    return model, {"time": t, "torque": torque, "measured": angle}, truth
 
 
 def duffing() -> Plant:
@@ -75,7 +75,7 @@ def duffing() -> Plant:
 
 
 def slide() -> Plant:
-    """A slide on a guide with dry friction and a slope, of which nothing pulls it back."""
+    """A slide on a guide with dry friction and a slope, and no restoring force."""
     rng, t = np.random.default_rng(5), 0.01 * np.arange(1500, dtype=np.float64)
     wanted = 0.1 * np.sin(2 * np.pi * 0.35 * t) + 0.05 * np.sin(2 * np.pi * 0.9 * t + 1.0)
     force, x = np.zeros(t.size), np.zeros((t.size, 2))
@@ -87,12 +87,12 @@ def slide() -> Plant:
         force[k] = 6e3 * (wanted[k] - x[k, 0]) - 600.0 * x[k, 1]
         step = solve_ivp(rates, (0.0, 0.01), x[k], args=(force[k],), method="LSODA", rtol=1e-8)
         x[k + 1] = step.y[:, -1]
-    record = {"time": t, "force": force, "shown": x[:, 0] + 1e-5 * rng.standard_normal(t.size)}
+    record = {"time": t, "force": force, "measured": x[:, 0] + 1e-5 * rng.standard_normal(t.size)}
     q, v, u, *p = (ca.SX.sym(n) for n in ("q", "v", "force", "M", "c"))
     model = psa.ode_model(
         {"x": [q, v], "u": u, "p": p, "ode": [v, (u - p[1] * v) / p[0]], "y": q},
         name="slide",
-        outputs=["shown"],
+        outputs=["measured"],
         parameters=[
             psa.Parameter("M", 30.0, "1", (5.0, 500.0), "mass", log=True),
             psa.Parameter("c", 60.0, "1", (1.0, 2000.0), "viscous friction", log=True),
@@ -106,12 +106,12 @@ def _log(name: str, value: float) -> psa.Parameter:
 
 
 def spring() -> psa.Model:
-    """Return a mass on a spring, as it was when new."""
+    """Return a mass on a spring before ageing."""
     x, v, u, k, c = (ca.SX.sym(n) for n in ("x", "v", "u", "k", "c"))
     return psa.ode_model(
         {"x": [x, v], "u": u, "p": [k, c], "ode": [v, u - k * x - c * v], "y": x},
         name="spring",
-        outputs=["shown"],
+        outputs=["measured"],
         parameters=[_log("k", 50.0), _log("c", 0.5)],
     )
 
@@ -127,7 +127,7 @@ def aged(seed: int) -> Table:
         return [q[1], np.interp(s, t, u) - 60.0 * soft * q[0] - 0.8 * q[1]]
 
     x = solve_ivp(rates, (0, t[-1]), [0, 0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.01).y[0]
-    return {"time": t, "u": u, "shown": x + 0.002 * rng.standard_normal(t.size)}
+    return {"time": t, "u": u, "measured": x + 0.002 * rng.standard_normal(t.size)}
 
 
 def battery() -> tuple[psa.Model, Table]:

@@ -131,7 +131,7 @@ def test_causes_that_cancel_each_other_are_reported() -> None:
 
 
 #: Tests that share a diagnosis run in one process.
-shares_hysteresis = pytest.mark.xdist_group("own hysteresis")
+shares_hysteresis = pytest.mark.xdist_group("oscillator hysteresis")
 _HOSTILE = "</script><img src=x onerror=alert(1)> $x_"
 
 
@@ -286,7 +286,7 @@ def test_dry_friction_of_a_motor_is_detected_at_its_shaft(
 @pytest.mark.slow
 @shares_hysteresis
 def test_a_cause_that_no_effect_has_is_unexplained(tmp_path: Path) -> None:
-    """Golden answers (own/breathing) have the same verdict by all kinds of effects."""
+    """The golden answer of `breathing` has the same verdict with all kinds of effects."""
     few = ["hysteresis", "stop", "curve"]
     d = psa.diagnose(oscillator(), plants.breathing(4), leave_out=few)
     assert d.verdict == "unexplained"
@@ -383,7 +383,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
 def test_the_help_of_both_faces_mentions_user_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
         assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
-        assert str(face.__doc__).count(word) >= 2  # in the signature and in words
+        assert str(face.__doc__).count(word) >= 2  # in the signature and in the text
 
 
 def test_records_that_do_not_fit_are_refused_in_sentences() -> None:

@@ -16,9 +16,9 @@ from psa_casadi.simulation.stepper import SimulationError
 from tests.any_model import hard_plants as hard
 
 
-def _near(found: Mapping[str, float], truth: Mapping[str, float], rel: float = 0.04) -> None:
-    for name, value in truth.items():
-        assert found[name] == pytest.approx(value, rel=rel), name
+def _near(values: Mapping[str, float], truth: Mapping[str, float], rel: float = 0.04) -> None:
+    for name, true_value in truth.items():
+        assert values[name] == pytest.approx(true_value, rel=rel), name
 
 
 def _codes(notes: Any) -> set[str]:
@@ -29,7 +29,7 @@ def test_parts_find_the_parameters_of_an_unstable_plant_and_that_its_input_is_he
     model, record, truth = hard.pendulum()
     result = psa.identify(model, record)
     _near(result.model.values, truth)
-    assert result.rms["shown"] == pytest.approx(0.002, rel=0.05)
+    assert result.rms["measured"] == pytest.approx(0.002, rel=0.05)
     assert {"in_parts", "hold_found"} <= _codes(result.notes)
     assert len(result.experiments) > 4
     assert all(e.record.hold == "zero" for e in result.experiments)
@@ -66,10 +66,10 @@ def test_parts_are_fitted_where_no_whole_record_can_be_simulated() -> None:
     model = psa.ode_model(
         {"x": q, "u": inflow, "p": a, "ode": a * q**2 + inflow, "y": q},
         name="runaway",
-        outputs=["shown"],
+        outputs=["measured"],
         parameters=[psa.Parameter("a", 3.0, "1", (0.2, 20.0), "rate constant", log=True)],
     )
-    record = {"time": t, "u": u, "shown": x[:-1] + 0.01 * rng.standard_normal(t.size)}
+    record = {"time": t, "u": u, "measured": x[:-1] + 0.01 * rng.standard_normal(t.size)}
     whole = experiments_of(model, given_to(model, record, None), judged=False)
     with pytest.raises(SimulationError, match="cannot be simulated on these records"):
         search_starts(model, whole, ["a"], starts=1)
@@ -90,7 +90,7 @@ def test_what_is_missing_in_an_unstable_plant_is_named() -> None:
 
 @pytest.mark.slow
 def test_what_an_integrator_lacks_is_named_and_judged_on_the_whole_record() -> None:
-    """A slide on a guide with dry friction and a slope, of which nothing pulls it back."""
+    """A slide on a guide with dry friction and a slope, and no restoring force."""
     model, record, truth = hard.slide()
     d = psa.diagnose(model, record)
     assert {c.effect for c in d.causes} == {"friction_in_v", "constant_in_v"}

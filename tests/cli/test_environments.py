@@ -20,7 +20,7 @@ from tests.records.record_files import write
 from tests.tiers import posix, slow_but
 
 FAULT = "This is a fault of psa_casadi"
-#: A locale that knows ASCII alone, which Python does not replace by UTF-8.
+#: A locale of ASCII alone, which Python does not replace by UTF-8.
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 
 
@@ -104,7 +104,7 @@ REFUSED: dict[str, tuple[BaseException, str]] = {
     "memory of C++": (RuntimeError("std::bad_alloc"), "too little memory; close"),
     "threads": (RuntimeError("can't start new thread"), "no more threads may be started"),
     "no temporary folder": (
-        FileNotFoundError(errno.ENOENT, "No usable temporary directory found in ['/tmp']"),
+        FileNotFoundError(errno.ENOENT, "No usable temporary directory in ['/tmp']"),
         "set TMPDIR to one",
     ),
     "package missing": (
@@ -188,12 +188,12 @@ def test_a_compiler_that_does_not_work(
 def test_a_compiler_may_have_arguments_and_spaces(
     tmp_path: Path, empty_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    script = program(tmp_path / "my cc", 'echo "$@" > ../../said; exec cc "$@"')
+    script = program(tmp_path / "my cc", 'echo "$@" > ../../arguments; exec cc "$@"')
     monkeypatch.setenv("CC", str(script))
     compiler.shared_library({"a.c": "int a;"}, ())
     monkeypatch.setenv("CC", f"'{script}' -D'X=\"a b\"'")
     compiler.shared_library({"a.c": "int a;"}, ())
-    assert '-DX="a b" -std' in (empty_cache / "said").read_text()
+    assert '-DX="a b" -std' in (empty_cache / "arguments").read_text()
 
 
 @posix

@@ -34,7 +34,7 @@ TABLE = [psa.EFFECTS["slow_creep"], psa.EFFECTS["offset_drift"]]
 
 @pytest.fixture(autouse=True)
 def _threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work is done side by side, as it is for users, where the other tests have one thread."""
+    """Work runs in parallel, as for users; the other tests have one thread."""
     monkeypatch.setenv(VARIABLE, "2")
 
 

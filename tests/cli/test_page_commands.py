@@ -43,7 +43,7 @@ def spans() -> list[tuple[str, str]]:
 
 
 def wrong_word(command: Any, words: list[str]) -> str:
-    """Return the first word that a command does not take, "" where it takes all."""
+    """Return the first word that a command rejects, "" if it accepts all."""
     while words and (inner := getattr(command, "commands", {}).get(words[0])) is not None:
         command, words = inner, words[1:]
     options = {o: p for p in command.params for o in (*p.opts, *p.secondary_opts) if o[0] == "-"}

@@ -83,7 +83,7 @@ def done(*words: str | Path) -> Ended:
 
 
 def refused(*words: str | Path, code: int = 2, folder: Path | None = None) -> str:
-    """Run a command that must fail without a traceback and leave a folder as it was."""
+    """Run a command that must fail without a traceback and leave a folder unchanged."""
     before = _content(folder)
     ended = command(*words)
     assert ended.code == code, ended.words

@@ -358,4 +358,4 @@ def test_the_papers_method_identifies_what_it_can_and_names_the_rest(tmp_path: P
     ended = command("identify", path, "--method", "paper", "-o", tmp_path / "m.json")
     assert ended.code == 0, ended.words
     assert error_share(tmp_path / "m.json") < 0.1
-    assert "step" in ended.words  # what its conditions lack
+    assert "step" in ended.words  # which its conditions lack

@@ -130,7 +130,7 @@ def test_what_does_not_fit_is_named() -> None:
 
 @slow
 def test_a_designed_record_distinguishes_two_effects(tmp_path: Path) -> None:
-    """The one that is there is named, on a record that was designed with ordinary sizes."""
+    """The present effect is named on a record that was designed with ordinary sizes."""
     psa.save_model(tanks(), tmp_path / "m.json")
     done(
         "design", "experiment", "--model", tmp_path / "m.json", "--input", "q=0:8e-4", "--input",

@@ -31,7 +31,7 @@ def displacement() -> FloatArray:
     return result + 5e-9 * np.random.default_rng(2).standard_normal(TIME.size)
 
 
-def _told(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.StackDiagnosis:
+def _diagnosed(y: FloatArray, voltage: FloatArray = VOLTAGE) -> psa.StackDiagnosis:
     record = psa.Record(name="r", time=TIME, voltage=voltage, displacement=y)
     return psa.diagnose([record], effects=TABLE)
 
@@ -44,7 +44,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
         "drift": 1e-6 * TIME + 1e-8 * rng.standard_normal(TIME.size),
         "another device": 1e-6 * np.sin(2 * np.pi * 3.7 * TIME),
     }[kind]
-    result = _told(y)
+    result = _diagnosed(y)
     assert result.verdict == "not_driven"
     assert not result.causes
     assert "same device" in result.notes[-1]
@@ -52,7 +52,7 @@ def test_a_displacement_without_the_voltage_is_not_diagnosed(kind: str) -> None:
 
 
 def test_a_flipped_sign_is_reported_with_figures(displacement: FloatArray) -> None:
-    result = _told(-displacement)
+    result = _diagnosed(-displacement)
     assert result.verdict == "not_driven"
     assert (
         "the sign of the displacement flipped the base model explains 100.00 %" in result.notes[-1]
@@ -62,7 +62,7 @@ def test_a_flipped_sign_is_reported_with_figures(displacement: FloatArray) -> No
 
 @pytest.mark.parametrize("factor", slow_but([1e3], [1e-6, 1e3]))
 def test_another_unit_of_displacement_is_reported(factor: float, displacement: FloatArray) -> None:
-    result = _told(factor * displacement)
+    result = _diagnosed(factor * displacement)
     assert result.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
 
@@ -100,13 +100,13 @@ def test_modes_that_no_base_has_are_not_taken_for_another_device() -> None:
 def test_what_no_fit_can_start_from_is_refused_in_words(displacement: FloatArray) -> None:
     rest = np.ones(TIME.size)
     with pytest.raises(psa.InputError, match="m, more than a stack with any sensor: its unit"):
-        _told(1e6 * displacement)
+        _diagnosed(1e6 * displacement)
     with pytest.raises(psa.InputError, match="The voltage is 40 V throughout"):
-        _told(displacement, 40.0 * rest)
+        _diagnosed(displacement, 40.0 * rest)
     with pytest.raises(psa.InputError, match="The displacement is 1e-06 m throughout: the sensor"):
-        _told(1e-6 * rest)
+        _diagnosed(1e-6 * rest)
     with pytest.raises(psa.InputError, match="two values only, 0 and 1e-05 m: that is a switch"):
-        _told(np.where(displacement > np.mean(displacement), 1e-5, 0.0))
+        _diagnosed(np.where(displacement > np.mean(displacement), 1e-5, 0.0))
 
 
 @slow

@@ -69,7 +69,7 @@ def test_one_of_its_kind_that_explains_much_more_leaves_the_form_open() -> None:
 
 
 def test_what_has_no_name_is_shared_by_corrections_alone() -> None:
-    """A quarter less evidence are odds of exp(1/2): a model without the cause knows little."""
+    """Three quarters of the evidence give odds of exp(1/2), much less than exp(100)."""
     rows = [_patch("memory", "force", 400.0), _patch("curve", "reading", 300.0)]
     displayed = CauseEvidence(400.0, FEW)
     first, second = families({}, {}, displayed, rows, LIMITS)

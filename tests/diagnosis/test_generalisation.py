@@ -32,7 +32,7 @@ def fitted() -> tuple[Fit, FloatArray, FloatArray]:
     return fit(model, (split(record),), ["k_L"], sigma=[LEVEL]), voltage, clean
 
 
-def _own(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnColour:
+def _colour(experiments: tuple[Experiment, ...], errors: list[FloatArray]) -> OwnColour:
     """The colour of errors where no parameter can follow and no clock jitters."""
     used, held = ([getattr(e, name) for e in experiments] for name in ("used", "held_out"))
     none = np.zeros((sum(int(u.sum()) for u in used), 0))
@@ -47,7 +47,7 @@ def _excess(fitted: tuple[Fit, FloatArray, FloatArray], error: FloatArray) -> fl
     )
     used = error[experiments[0].used]
     observed = replace(result, experiments=experiments, residuals=used)
-    colour = _own(experiments, [error])
+    colour = _colour(experiments, [error])
     noise = noise_floor([experiments[0].record], [error])
     return held_out_excess(observed, (clean,), colour, noise, LIMITS).factor
 
@@ -100,7 +100,7 @@ def test_a_held_out_record_with_different_noise_is_no_reason_to_doubt(
         predicted = (clean, clean[:samples] + offset)
         left = [errors[0], errors[1][:samples] - offset]
         noise = noise_floor([e.record for e in experiments], left)
-        colour = _own(experiments, left)
+        colour = _colour(experiments, left)
         items.append(held_out_excess(observed, predicted, colour, noise, LIMITS).factor)
     assert items == [1.0] * 25
 
@@ -133,10 +133,10 @@ def test_a_model_that_fails_on_the_held_out_record_is_not_adequate(tmp_path: Pat
 @slow
 def test_a_named_cause_does_not_hide_that_the_held_out_record_is_another(tmp_path: Path) -> None:
     """After its first tenth the sensor shows 0.5 % more: the creep is named, and more is left."""
-    path, shown_again = tmp_path / "creeping.csv", tmp_path / "again.csv"
+    path, second = tmp_path / "creeping.csv", tmp_path / "again.csv"
     truth = make_record("slow_creep", 11, path, visible=(1.0, 2.0))
-    play_again(truth, 1, shown_again)
-    record, again = psa.read_record(path), psa.read_record(shown_again)
+    play_again(truth, 1, second)
+    record, again = psa.read_record(path), psa.read_record(second)
     effects = [psa.EFFECTS["slow_creep"]]
     same = psa.diagnose([record], holdout=[again], effects=effects)
     assert same.verdict == "cause_named"

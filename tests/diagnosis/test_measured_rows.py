@@ -36,9 +36,9 @@ def within(value: float, cell: str) -> bool:
     return low - 0.01 <= value <= high + 0.01
 
 
-def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
-    """Hold a diagnosis, as its JSON has it, against a row of the page."""
-    base, extended, statement = rows()[given]
+def assert_as_in_the_row(d: dict[str, Any], label: str) -> None:
+    """Assert that the JSON of a diagnosis agrees with a row of the page."""
+    base, extended, statement = rows()[label]
     assert statement.startswith(f"`{d['verdict']}`")
     named = {n for c in d["causes"] for n in (c["effect"], *c["cannot_be_told_from"])}
     written = set(re.findall(r"`([a-z_]+)`", statement)) & set(psa.EFFECTS)
@@ -57,7 +57,7 @@ def is_what_the_row_says(d: dict[str, Any], given: str) -> None:
 def test_the_record_of_the_readme_s_picture_gives_its_row(measured_data: Path) -> None:
     record = psa.read_record(measured_data / "micromanipulator" / "sine_1hz.csv")
     content = json.loads(psa.diagnose([record]).to_json())
-    is_what_the_row_says(content, "`sine_1hz.csv`")
+    assert_as_in_the_row(content, "`sine_1hz.csv`")
     assert content["budget"]["together"]["share"] > 0.95
 
 
@@ -68,4 +68,4 @@ def test_the_commands_of_the_readme_give_the_row_of_their_record(tmp_path: Path)
     assert any("records/minor_loops.csv" in command for command in block.commands)
     assert run_block(block, tmp_path) is None
     content = json.loads((tmp_path / "diagnosis.json").read_text(encoding="utf-8"))
-    is_what_the_row_says(content, "`minor_loops.csv`")
+    assert_as_in_the_row(content, "`minor_loops.csv`")

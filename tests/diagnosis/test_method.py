@@ -1,4 +1,4 @@
-"""What a step of the method and its constants are good for is counted, and constants decide."""
+"""The ablation counts the effect of each step and constant of the method."""
 
 from collections.abc import Sequence
 from dataclasses import fields, replace
@@ -22,16 +22,18 @@ from tests.studies.benchmarks.hidden_cases import Case, CaseResult
 NAMES = ("slow_creep", "current_limit", "sensor_nonlinearity")
 
 
-def _found(effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1) -> CaseResult:
-    case = Case(kind, effect, seed)  # type: ignore[arg-type]  # the kinds below are those it knows
+def _case_result(
+    effect: str, named: tuple[str, ...], kind: str = "known", seed: int = 1
+) -> CaseResult:
+    case = Case(kind, effect, seed)  # type: ignore[arg-type]  # all kinds below are valid
     verdict: Verdict = "cause_named" if named else "unexplained"
     return CaseResult(case, 1.0, verdict, named, named, (), {}, 1.0)
 
 
 def test_what_a_step_is_good_for_shows_in_the_ablation() -> None:
     """Without the finite steps all three effects are taken for backlash; nothing else changes."""
-    whole = [_found(n, (n,)) for n in NAMES]
-    whole.append(replace(_found("dry_friction", (), "foreign", 9), patched=0.75))
+    whole = [_case_result(n, (n,)) for n in NAMES]
+    whole.append(replace(_case_result("dry_friction", (), "foreign", 9), patched=0.75))
     worse = [replace(f, named=("backlash",), within=("backlash",)) for f in whole[:3]]
     methods: list[Method] = []
 

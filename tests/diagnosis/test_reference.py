@@ -22,7 +22,7 @@ CREEPS, CLEAN = (next(r for r in RECORDS if r.name.startswith(name)) for name in
 
 
 def recorded(name: str, *, noise: int, gain: float = 1.0, sound: bool = False) -> psa.Record:
-    """Return a record of the exam with noise anew; `sound` without what it hides."""
+    """Return a record of the exam with new noise; if `sound`, without its hidden effect."""
     inputs = next(r for r in RECORDS if r.name.startswith(name))
     played = play(replace(inputs, hidden={}) if sound else inputs)
     sigma = 1e-2 * inputs.test.noise * float(np.ptp(played.clean))

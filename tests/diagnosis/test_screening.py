@@ -64,7 +64,7 @@ def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: flo
 
 
 def _size_test(
-    residual: FloatArray, *, own: bool = False, lengths: tuple[int, ...] = (N,)
+    residual: FloatArray, *, residual_colour: bool = False, lengths: tuple[int, ...] = (N,)
 ) -> float:
     colour = Colour(tuple(np.zeros(0) for _ in lengths), 1.0, lengths)
     return omnibus(
@@ -75,21 +75,21 @@ def _size_test(
         1.0,
         lengths=lengths,
         detection_limit=0.0,
-        own=own,
+        own=residual_colour,
         alarms_below=1e-3,
     ).p_value
 
 
 def test_noise_of_one_size_is_no_misfit_and_noise_after_reversals_only_is() -> None:
-    """What a colour swallows of a misfit is larger where the misfit is."""
+    """Noise whose size follows the reversals is significant unless the colour is the residual's."""
     quiet = [_size_test(noise(0.0, seed)) for seed in range(20)]
     assert min(quiet) > 1e-3
     after = 1.0 + np.exp(-((TIME % 0.5) / 0.05))
     assert _size_test(after * noise(0.0)) < 1e-6
-    assert _size_test(after * noise(0.0), own=True) > 1e-3
+    assert _size_test(after * noise(0.0), residual_colour=True) > 1e-3
 
 
-def _own(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:
+def _colour(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:
     """The colour of an error with a gap, of which the last fifth is held out."""
     used, held = np.arange(N) < 0.8 * N, np.arange(N) >= 0.8 * N
     used[1000:1010] = False
@@ -99,7 +99,7 @@ def _own(error: FloatArray, columns: FloatArray, rate: FloatArray) -> OwnColour:
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6, 0.95])
 def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
-    result = _own(noise(correlation), np.zeros((N, 0)), np.zeros(N))
+    result = _colour(noise(correlation), np.zeros((N, 0)), np.zeros(N))
     assert result.runs == (1000, 3790)
     assert result.level == pytest.approx(np.sqrt(1.0 - correlation**2), rel=0.04)
     assert np.std(result.ahead) == pytest.approx(result.level, rel=0.06)
@@ -108,11 +108,13 @@ def test_a_residual_has_the_colour_that_made_it(correlation: float) -> None:
 
 
 def test_slow_waves_are_no_evidence_next_to_a_random_walk() -> None:
-    """White noise would speak for them with hundreds of nats."""
+    """With white noise the evidence for them would be hundreds of nats."""
     walk = np.cumsum(np.random.default_rng(3).standard_normal(N))
     waves = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, N), np.arange(8)))
     left = [walk - w @ np.linalg.lstsq(w, walk, rcond=None)[0] for w in (waves[:, :4], waves)]
-    few, more = (_own(e, w, np.zeros(N)) for e, w in zip(left, (waves[:, :4], waves), strict=True))
+    few, more = (
+        _colour(e, w, np.zeros(N)) for e, w in zip(left, (waves[:, :4], waves), strict=True)
+    )
     assert few.level == pytest.approx(1.0, rel=0.03)
     assert more.nats() - few.nats() < 12.0
     assert 0.5 * N * np.log(np.var(left[0]) / np.var(left[1])) > 250.0
@@ -122,13 +124,13 @@ def test_the_noise_of_a_clock_that_jitters_grows_with_the_rate() -> None:
     rng, rate = np.random.default_rng(5), np.abs(np.gradient(VOLTAGE))
     rate = rate / np.sqrt(np.mean(rate**2))
     error = rng.standard_normal(N) + 3.0 * rate * rng.standard_normal(N)
-    result = _own(error, np.zeros((N, 0)), rate)
+    result = _colour(error, np.zeros((N, 0)), rate)
     assert result.spread is not None
-    assert result.nats() > _own(error, np.zeros((N, 0)), np.ones(N)).nats() + 300.0
+    assert result.nats() > _colour(error, np.zeros((N, 0)), np.ones(N)).nats() + 300.0
     white = result.colour.whiten(result.residuals)
     fast = rate[np.r_[0:1000, 1010 : int(0.8 * N)]] > 1.0
     assert white[fast].std() == pytest.approx(white[~fast].std(), rel=0.08)
-    even = [_own(noise(0.0, k), np.zeros((N, 0)), rate).spread for k in range(20)]
+    even = [_colour(noise(0.0, k), np.zeros((N, 0)), rate).spread for k in range(20)]
     assert even == [None] * 20
 
 

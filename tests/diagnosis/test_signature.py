@@ -10,7 +10,7 @@ from psa_casadi.model.effects import EFFECTS
 from tests.contract.helpers import refused
 
 #: Coordinates along which an effect shows by its physics.
-TOLD = {
+COORDINATES = {
     "slow_creep": {"holds"},
     "hysteresis_memory": {"from_reversal"},
     "rate_independent_asymmetry": {"from_reversal"},
@@ -34,10 +34,10 @@ TOLD = {
 }
 
 
-@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("name", COORDINATES)
 def test_the_telling_coordinate_is_the_physical_one(name: str) -> None:
     observed = signature(EFFECTS[name])
-    assert observed.telling.name in TOLD[name]
+    assert observed.telling.name in COORDINATES[name]
     assert 0.5 < observed.telling.share <= 1.0
 
 

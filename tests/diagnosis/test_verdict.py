@@ -38,7 +38,7 @@ def triangle() -> Record:
     return Record(name="r", time=time, voltage=voltage, displacement=y + noise)
 
 
-def shown_up_to(record: Record, share: float) -> Record:
+def saturated_above(record: Record, share: float) -> Record:
     """Return the record of a sensor that is saturated above a share of its range."""
     y = record.displacement
     assert y is not None
@@ -61,7 +61,7 @@ def shown_up_to(record: Record, share: float) -> Record:
 def test_a_record_that_hides_nearly_all_names_no_cause(
     share: float, effect: str, message: str, triangle: Record
 ) -> None:
-    result = diagnose([shown_up_to(triangle, share)], effects=[EFFECTS[effect]])
+    result = diagnose([saturated_above(triangle, share)], effects=[EFFECTS[effect]])
     assert result.causes == ()
     assert message in result.doubt
     assert result.doubt in " ".join(story(result).split())
@@ -69,7 +69,7 @@ def test_a_record_that_hides_nearly_all_names_no_cause(
 
 @pytest.mark.parametrize("share", [0.12, 0.15, 0.2, 0.5])
 def test_an_end_is_reported_with_little_data_below_it(share: float, triangle: Record) -> None:
-    record = shown_up_to(triangle, share)
+    record = saturated_above(triangle, share)
     y = record.displacement
     assert y is not None
     (end,) = suspects(record).ends

@@ -460,7 +460,7 @@ def tone(t: FloatArray, signal: FloatArray, frequency: float) -> complex:
 
 @pytest.mark.parametrize("level", [0.7, 0.85])
 def test_a_clip_makes_flat_tops_at_its_level(level: float) -> None:
-    """Behind a hard clip the stack does what it does at the clipped command: twice a flat top."""
+    """With a hard clip the response equals that to the clipped command, which has two flat tops."""
     t = np.linspace(0.0, 1.0, 2001)
     voltage = 60.0 * (1.0 - np.cos(4 * np.pi * t))
     hard = simulated(with_effect(voltage_saturation, clip_gain=1.0, clip_level=level), t, voltage)

@@ -89,7 +89,7 @@ def test_every_page_has_what_was_executed() -> None:
         assert "\n## What was executed\n" in examples()[name].text, name
 
 
-#: The words that each tool has for what its scripts do, from its documentation.
+#: The names that each tool accepts in its scripts, from its documentation.
 WORDS = {
     "openmodelica": "loadModel loadFile getErrorString getClassNames simulate startTime stopTime"
     " numberOfIntervals tolerance outputFormat importFMU workdir loglevel fullPath true wrapper"
@@ -254,7 +254,7 @@ def test_the_jobs_of_ci_are_yaml_and_their_commands_run(
         if program == "psa":
             run_command(command)
             continue
-        if "install" in words:  # what builds it is here, what it depends on may not be
+        if "install" in words:  # its build tools are here, its dependencies may be absent
             pytest.importorskip("pip")
             words += ["--dry-run", "--no-deps", "--no-build-isolation", "--no-index"]
         subprocess.run([sys.executable, *words], check=True, timeout=300)

@@ -65,7 +65,7 @@ def try_step(instance: Instance, point: float, size: float) -> Step:
 
 
 class Instance3(importer.Instance):
-    """One instance; what it does not succeed in raises FmuError, what is tried returns a status.
+    """One instance; a failed call raises FmuError, a method `try_*` returns its status.
 
     `watcher` is called between two steps of the solver (intermediate update) and may end the step
     there if `early`; `events` asks for event mode in co-simulation.

@@ -37,7 +37,7 @@ _BEYOND = 1e3
 
 
 class SspArchive:
-    """An SSP archive with its FMUs; a context manager that removes what it extracted.
+    """An SSP archive with its FMUs; a context manager that removes the extracted files.
 
     `name` is that of the system, `wires` its connections, `parameters` the values that its
     parameter sets give to each part, `fmus` the parts.

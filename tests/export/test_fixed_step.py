@@ -1,4 +1,4 @@
-"""The fixed step in C: its error, its form, what it refuses, and the command that writes it.
+"""The fixed step in C: its error, its form, refused models, and the command that writes it.
 
 Beyond the rated voltage it is as good as stated, or limited, with a flag.
 """

@@ -345,7 +345,7 @@ def test_what_the_compiler_of_the_system_makes_passes(
     """No wheel of a compiler: the FMU is for systems like this one, and sound."""
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.has_zig", lambda: False)
     monkeypatch.setenv("CC", "gcc")
-    report = psa.check_fmu(psa.export_fmu(model_named(STACK), tmp_path / "own.fmu"))
+    report = psa.check_fmu(psa.export_fmu(model_named(STACK), tmp_path / "model.fmu"))
     assert report.passed, _failures(report)
     assert "loads on GNU libc 2." in next(r.remark for r in report.rows if r.name == "GNU libc")
 

@@ -451,7 +451,7 @@ def test_a_snapshot_that_frees_itself(either: Instance) -> None:
 
 @VERSIONS
 def test_messages_of_fmi_2_are_formats_and_those_of_fmi_3_are_not(fmi: int) -> None:
-    """Printed as a format, the message is what was meant: nothing is inserted or looked up."""
+    """Printed as a format, the message is unchanged: nothing is inserted or looked up."""
     with Fmu(exported(STACK, fmi)) as fmu, fmu.start(CO_SIMULATION) as slave:
         names = (ctypes.c_char_p * 1)(b"%s%s%n #r1# 100 %")
         assert slave.call("SetDebugLogging", 1, 1, names) == ERROR

@@ -202,7 +202,7 @@ def symbolic(model: psa.Model) -> ca.Function:
     """Return the same f of the model itself."""
     sizes = (len(model.state_names), len(model.input_names), len(model.parameter_names))
     x, u, p = (ca.MX.sym(n, size) for n, size in zip("xup", sizes, strict=True))
-    return ca.Function("own", [x, u, p], list(model.structure.f(0.0, x, u, p)))
+    return ca.Function("rates", [x, u, p], list(model.structure.f(0.0, x, u, p)))
 
 
 def a_point(model: psa.Model) -> tuple[FloatArray, FloatArray, FloatArray]:

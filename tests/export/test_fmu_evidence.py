@@ -160,7 +160,8 @@ def test_inside_nothing_is_logged(fmi: int) -> None:
 def test_leaving_the_voltage_is_logged_once(fmi: int) -> None:
     (line,), outside = messages(fmi, 120.0, 0.6)
     assert line.startswith("voltage is 7")
-    low, high = stated().seen.voltage.low, stated().seen.voltage.high
+    voltage = stated().seen.voltage
+    low, high = voltage.low, voltage.high
     assert f"from {low:.6g} to {high:.6g}." in line
     beyond = (120.0 - high) / (high - low) - 0.01
     assert np.max(outside) == pytest.approx(beyond, abs=2e-3)

@@ -132,7 +132,7 @@ def test_every_way_to_end_has_its_remark(
 
 
 def test_the_command_fails_with_the_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ended with exit code 0, and without a word."""
+    """It ended with exit code 0 and without a message."""
     monkeypatch.setenv(DEED, "load:exit")
     path = hostile_fmu(tmp_path / "h.fmu", 2)
     ended = command("check", path, "--timeout", "30", "--memory", "512")
@@ -236,7 +236,7 @@ def _named(*names: str) -> Change:
     def add(archive: zipfile.ZipFile) -> None:
         for name in names:
             entry = zipfile.ZipInfo("x")
-            entry.filename = entry.orig_filename = name  # as it is, with what ZipInfo would mend
+            entry.filename = entry.orig_filename = name  # ZipInfo would clean it
             archive.writestr(entry, b"text")
 
     return add

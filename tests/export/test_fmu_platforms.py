@@ -327,7 +327,7 @@ def test_valgrind_finds_nothing() -> None:
     assert not complaints([*guard, "--show-leak-kinds=all", program])
 
 
-#: The guard, the word it must say, and the fault: a file, what is in it, and what takes its place.
+#: The guard, a word of its message, and the fault: a file, its text, and the replacement.
 FAULTS = {
     "a read behind an array": (
         "memory", "AddressSanitizer: global-buffer-overflow",

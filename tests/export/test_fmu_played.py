@@ -61,7 +61,7 @@ def test_effects_around_a_whole_fmu_are_those_of_the_equations(tmp_path: Path) -
     }  # fmt: skip
     symbolic = _first_order()
     whole = psa.fmu_model(
-        psa.export_fmu(symbolic, tmp_path / "own.fmu"), free=["k"], interface="co-simulation"
+        psa.export_fmu(symbolic, tmp_path / "model.fmu"), free=["k"], interface="co-simulation"
     )
     table = {e.name: e for e in effects_of(whole, ALL)}
     items = []
@@ -182,7 +182,7 @@ def test_an_fmu_of_which_one_instance_lives_is_run_as_a_whole() -> None:
 
 
 def test_communication_points_are_what_the_fmu_takes(tmp_path: Path) -> None:
-    path = psa.export_fmu(_first_order(), tmp_path / "own.fmu")
+    path = psa.export_fmu(_first_order(), tmp_path / "model.fmu")
     uneven = np.array([0.0, 0.1, 0.25, 0.3])
     with Fmu(path) as fmu:
         co = fmu.description.coSimulation

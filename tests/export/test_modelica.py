@@ -48,11 +48,11 @@ def test_the_package_is_the_one_that_was_accepted(tmp_path: Path) -> None:
     assert "PiezoStack.Signal, PiezoStack.Acausal, PiezoStack.Examples.Sine" in words
     expected = _without_version(_GOLDEN.read_text(encoding="utf-8"))
     texts = _without_version(path.read_text(encoding="utf-8"))
-    diff = "".join(difflib.unified_diff(expected, texts, "accepted", "found", n=1))
+    diff = "".join(difflib.unified_diff(expected, texts, "accepted", "now", n=1))
     assert not diff, f"{diff}\nIf this is meant: {_ACCEPT}"
 
 
-def _decay(parameter: str = "rate", output: str = "shown", state: str = "z") -> psa.Component:
+def _decay(parameter: str = "rate", output: str = "measured", state: str = "z") -> psa.Component:
     return psa.Component(
         "decay", 'a "decay" \\ of <z>', "none",
         lambda s: psa.Equations(

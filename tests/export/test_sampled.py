@@ -196,7 +196,7 @@ def test_illegal_values_leave_an_error() -> None:
 
 
 SLOPE = 30.0
-OUTPUTS = ("shown", "voltage")
+OUTPUTS = ("measured", "voltage")
 
 #: Communication steps in periods: they divide it, are it, do not divide it, exceed it.
 STEPS = pytest.mark.parametrize("step", [0.25, 1.0, 0.7, 2.5])
@@ -299,7 +299,7 @@ def _shared() -> psa.Model:
             add={"displacement": z + x},
             der={"level": (s.push - x) / 5e-3},
             next={"first": 0.3 * part + 0.1 * s.displacement, "second": 0.2 * part**2 - 0.5 * w},
-            out={"shown": s.displacement},
+            out={"measured": s.displacement},
         )
 
     shared = psa.Component(
@@ -312,7 +312,7 @@ def _shared() -> psa.Model:
         ),
         sample_period="T_s",
         inputs=(psa.Input("push", "m", "push", nominal=1.0),),
-        outputs=(psa.Output("shown", "m", "displacement"),),
+        outputs=(psa.Output("measured", "m", "displacement"),),
     )  # fmt: skip
     return psa.compose([shared])
 
@@ -324,10 +324,10 @@ def test_shared_parts_and_balances_have_their_values_before_the_instant() -> Non
     assert re.search(r"shared_part = .*pre\(first\)", clause)
     assert "discrete Real shared_part(start=0.0, fixed=true)" in text
     assert "displacement" not in clause
-    result = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "shown"))
+    result = simulated(model, "push=1.0 - 30.0*time", ("first", "second", "measured"))
     times = grid(COUNT, 0.25)
     steps = psa.run(model, times, (1.0 - 30.0 * times)[:, None], np.zeros(1), rtol=1e-12)
     for name, column in (("first", steps.z[:, 0]), ("second", steps.z[:, 1])):
         assert np.abs(result[name] - column).max() < 1e-8, name
-    assert np.abs(result["shown"] - steps.y[:, 0]).max() < 1e-8
+    assert np.abs(result["measured"] - steps.y[:, 0]).max() < 1e-8
     assert np.ptp(steps.z[:, 0]) > 0.1

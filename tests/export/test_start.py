@@ -340,7 +340,7 @@ def test_the_derivatives_by_it_are_those_of_the_settled_start(fmi: int, voltage:
 
 @BOTH
 def test_what_is_set_by_itself_stays_whatever_the_order(fmi: int) -> None:
-    """States and the voltage; parameters and other inputs count as they are at the end."""
+    """States and the voltage; parameters and other inputs have their final values."""
     softer = model_named(NAME).plant().with_values({"k_L": 6.3})
     table = {"f_H": -40.0, "v_x": 2e-4, "voltage": 55.0}
     values = {START_VOLTAGE: 60.0, **table, "k_L": 6.3, "load_force": -20.0}

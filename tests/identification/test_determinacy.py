@@ -207,7 +207,7 @@ def test_slow_loops_of_a_ringing_stack_call_for_fast_records() -> None:
 
 @pytest.mark.parametrize("name", slow_but(["P-885.51"], ["PTBS200", "P-885.51"]))
 def test_following_the_advice_determines_what_it_promises(name: str) -> None:
-    """The truth beyond the loops is not known to the advice: PTBS200 rings, the other does not."""
+    """The advice does not use the truth beyond the loops: PTBS200 rings, the other does not."""
     model = stack(name)
     result, experiments, determined = loops(name)
     results = advised(name)

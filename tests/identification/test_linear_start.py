@@ -207,7 +207,7 @@ def test_irregular_samples_are_put_on_a_grid() -> None:
 
 @pytest.mark.parametrize("between", [False, True])
 def test_coarse_samples_determine_the_slower_part(between: bool) -> None:
-    """Eight samples a period of the ringing; the jump is a ramp of one sample, or lies in it."""
+    """Eight samples a period of the ringing; the jump is a ramp of one sample, or within it."""
     values = stack_values("PTBS200")
     fine = step_of("PTBS200")
     time, voltage = fine.time[::5], fine.voltage[::5]
@@ -282,7 +282,7 @@ def loops(name: str) -> list[Record]:
 
 
 def loop_errors(name: str, records: list[Record]) -> dict[str, float]:
-    """Return errors of what the loops show: k, A and the bends over k + A, n as it is."""
+    """Return errors of the identifiable quantities: k, A and the bends over k + A, and n."""
     p = stack_values(name)
     model = starting_model(records, p["k_B"])
     values = loop_start(model, records)

@@ -79,7 +79,7 @@ def test_residuals_above_the_weights_widen_it() -> None:
 
 
 def test_at_its_ends_the_cost_of_the_best_fit_has_grown_by_the_limit() -> None:
-    """R_s C_p lies far below the sampling: an interval that no standard error describes."""
+    """R_s C_p is far below the sampling interval: no standard error describes its interval."""
     result = fitted("k_L", "tau", "R_s")
     p = profile(result, "R_s")
     assert p.high is not None

@@ -1,4 +1,4 @@
-"""The search: exchanges, interruption, records of different kinds at once, what it warns of."""
+"""The search: exchanges, interruption, records of different kinds at once, warnings."""
 
 import threading
 import time

@@ -21,10 +21,10 @@ PLANT = psa.Component(
     ),
     states=(psa.State("position", "m", "position", nominal=1.0),),
     inputs=(psa.Input("disturbance", "V", "added to the command", nominal=1.0),),
-    outputs=(psa.Output("shown", "m", "position that is shown"),),
+    outputs=(psa.Output("measured", "m", "measured position"),),
     equations=lambda s: psa.Equations(
         der={"position": (s.gain * (s.command + s.disturbance) - s.position) / s.lag},
-        out={"shown": s.position},
+        out={"measured": s.position},
     ),
 )
 

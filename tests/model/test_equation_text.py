@@ -11,6 +11,8 @@ import psa_casadi as psa
 from psa_casadi.model.component import KeptEquations, OnDemand
 from psa_casadi.model.equation_text import FUNCTIONS, EquationTexts, equations_of, texts_of
 
+#: Where the texts are in a model file.
+PART = "own.a.equations"
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 
 
@@ -20,7 +22,7 @@ def kept(result: Any) -> KeptEquations:
 
 
 def read(text: str, **where: str) -> KeptEquations:
-    return equations_of(EquationTexts(where=where, der={"x": text}), "own.a.equations")
+    return equations_of(EquationTexts(where=where, der={"x": text}), PART)
 
 
 def value(of: KeptEquations, x: float, y: float) -> float:
@@ -51,7 +53,7 @@ def value(of: KeptEquations, x: float, y: float) -> float:
 def test_an_expression_is_written_as_people_write_it(built: Any, text: str) -> None:
     written = texts_of(kept(built))
     assert (written.der["x"], written.where) == (text, {})
-    again = equations_of(written, "own.a.equations")
+    again = equations_of(written, PART)
     for x, y in np.random.default_rng(0).uniform(0.1, 3.0, (20, 2)):
         np.testing.assert_equal(value(again, x, y), value(kept(built), x, y))
 
@@ -60,7 +62,7 @@ def test_an_expression_is_written_as_people_write_it(built: Any, text: str) -> N
 def test_every_function_reads_back_as_itself(name: str) -> None:
     inputs = [X, Y, ca.SX(0.7)][: FUNCTIONS[name]]
     built = getattr(ca, name)(*inputs)
-    again = equations_of(texts_of(kept(built)), "own.a.equations")
+    again = equations_of(texts_of(kept(built)), PART)
     for x, y in np.random.default_rng(1).uniform(-3.0, 3.0, (20, 2)):
         np.testing.assert_equal(value(again, x, y), value(kept(built), x, y))
 
@@ -69,7 +71,7 @@ def test_every_number_comes_back_bit_for_bit() -> None:
     rng = np.random.default_rng(2)
     numbers = [float(v) for v in rng.standard_normal(50) * 10.0 ** rng.integers(-300, 300, 50)]
     for number in [*numbers, 5e-324, 1.7976931348623157e308, 0.1 + 0.2, 1e15 + 1.0, 999999.0]:
-        again = equations_of(texts_of(kept(X + number)), "own.a.equations")
+        again = equations_of(texts_of(kept(X + number)), PART)
         assert value(again, 0.0, 0.0) == number
 
 
@@ -81,7 +83,7 @@ def test_what_is_used_often_or_is_long_has_a_name() -> None:
     every = [*written.where.values(), *written.der.values()]
     assert max(map(len, every)) < 1_000
     assert sum(map(len, every)) < 10_000
-    again = equations_of(written, "own.a.equations")
+    again = equations_of(written, PART)
     assert value(again, 0.4, 0.0) == pytest.approx(40.5e6 / 4.5 * 0.99, rel=0.02)
     assert texts_of(again) == written
 
@@ -91,7 +93,7 @@ def test_names_of_parts_are_none_of_the_symbols() -> None:
     function = ca.Function("equations", [a1], [ca.sin(a1) ** 2 + ca.sin(a1)])
     written = texts_of(KeptEquations(function, ("a1",), (("der", "x"),)))
     assert written.where == {"a2": "sin(a1)"}
-    again = equations_of(written, "own.a.equations")
+    again = equations_of(written, PART)
     assert float(again.function(0.5)) == float(function(0.5))
 
 
@@ -146,8 +148,8 @@ HOSTILE = {
     "a long sum": "x" + "+x" * 3_900,
     "towers": "x" + "**x" * 2_600,
     "a long text": "x+" * 100_000 + "x",
-    "the table's own name": "_table + 1",
-    "the table's other name": "made",
+    "the name of the table": "_table + 1",
+    "the other name of the table": "made",
     "a class": "__class__",
 }
 

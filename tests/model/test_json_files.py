@@ -1,4 +1,4 @@
-"""JSON that people give: read as it was written, or refused in sentences that name the place."""
+"""JSON of users: read exactly, or refused with a message that names the place."""
 
 import json
 import random

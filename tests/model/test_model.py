@@ -110,10 +110,11 @@ def evidence_in(model: psa.Model) -> Evidence:
 def test_it_has_the_ranges_of_the_record_and_the_errors_of_the_model() -> None:
     record, evidence = noisy_record(), evidence_in(evident_model())
     rates = np.abs(np.diff(record.voltage) / np.diff(record.time))
-    assert evidence.seen.voltage == Interval(record.voltage.min(), record.voltage.max())
-    assert evidence.seen.rate == pytest.approx(rates.max())
-    assert evidence.seen.duration == record.duration
-    assert evidence.seen.temperature is None
+    ranges = evidence.seen
+    assert ranges.voltage == Interval(record.voltage.min(), record.voltage.max())
+    assert ranges.rate == pytest.approx(rates.max())
+    assert ranges.duration == record.duration
+    assert ranges.temperature is None
     held = evidence.held_out
     assert held is not None
     assert held.interval_m.low < NOISE < held.interval_m.high

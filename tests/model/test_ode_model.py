@@ -1,4 +1,4 @@
-"""Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and what is refused in words."""
+"""Any CasADi ODE as a model: against scipy, in fmpy, in rumoca, and refused inputs."""
 
 import importlib
 import math
@@ -98,7 +98,7 @@ def test_inputs_outputs_parameters_and_time_against_scipy(tmp_path: Path) -> Non
 def test_a_function_of_casadi_is_an_ode_too() -> None:
     x, u, k = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("k")
     rates = ca.vertcat(x[1], u - k * x[0])
-    function = ca.Function("given", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
+    function = ca.Function("rates", [x, u, k], [rates], ["x", "u", "p"], ["xdot"])
     model = psa.ode_model(function, name="spring", parameters=["k"], values={"k": 4.0})
     assert model.state_names == ("x_0", "x_1")
     assert model.output_names == ("x_0_out", "x_1_out")
@@ -205,7 +205,7 @@ def _solved() -> dict[str, Any]:
     return {"x": u, "ode": root(x0=0.0, p=u)["x"]}
 
 
-#: What is wrong, the inputs, words of the sentence.
+#: The fault, the inputs, a part of the message.
 WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "unknown symbol": (lambda: {"x": X, "ode": K * X}, {}, "'ode' uses the symbol 'k'"),
     "unknown symbol in y": (lambda: {"x": X, "ode": X, "y": K}, {}, "'y' uses the symbol 'k'"),

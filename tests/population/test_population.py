@@ -33,7 +33,7 @@ from tests.any_model import own_plants as plants
 from tests.any_model.own_models import motor
 from tests.contract.helpers import done
 from tests.model.evidence_models import evident_model
-from tests.report.browser import DARK, PHONE, Browser, find_browser, seen_on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, find_browser, phone_view
 from tests.report.html_page import Page, figures
 from tests.report.report_cases import diagnosis, identification
 from tests.report.test_schemas import valid
@@ -380,7 +380,7 @@ def test_the_pages_in_a_browser(
         assert '<svg class="main-svg"' in box
     for flags in ((), (DARK,)):
         assert browser.serious_faults(page, *flags) == []
-    table = seen_on_a_phone(browser, page)
+    table = phone_view(browser, page)
     assert table["width"] == table["needed"] == PHONE
     assert table["outside"] == []
 

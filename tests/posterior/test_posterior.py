@@ -274,13 +274,13 @@ def records(seed: int) -> tuple[psa.Signals, ...]:
 
 
 @cache
-def own_task() -> Task:
+def user_task() -> Task:
     return own_task_of(motor(), records(1), starts=1, zeros=("i",))
 
 
 def test_every_output_of_every_record_has_a_separate_noise_level() -> None:
-    blocks = own_task().density.blocks
-    assert [(b.record, own_task().channel(b).column) for b in blocks] == [
+    blocks = user_task().density.blocks
+    assert [(b.record, user_task().channel(b).column) for b in blocks] == [
         (0, "w"),
         (1, "w"),
         (0, "i"),
@@ -288,12 +288,12 @@ def test_every_output_of_every_record_has_a_separate_noise_level() -> None:
     assert [b.count for b in blocks] == [600.0, 600.0, 599.0]  # the zero of i is integrated out
     np.testing.assert_allclose([b.level for b in blocks], [0.3, 1.2, 0.005], rtol=0.1)
     assert (
-        own_task().density.size == 4 + 2 * 2
+        user_task().density.size == 4 + 2 * 2
     )  # parameters, both states of both records: no offset
 
 
 def test_the_gradient_of_any_model_is_that_of_its_density() -> None:
-    density = own_task().density
+    density = user_task().density
     u, h = 0.5 * np.random.default_rng(1).standard_normal(density.size), 1e-3
     numeric = [(density(u + h * e)[0] - density(u - h * e)[0]) / (2 * h) for e in np.eye(len(u))]
     np.testing.assert_allclose(density(u)[1], numeric, atol=1e-4)

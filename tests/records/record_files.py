@@ -31,7 +31,7 @@ def write(path: Path, *lines: str, end: str = "\n", encoding: str = "utf-8") -> 
 
 
 def text(*head: str, columns: Sequence[Any] = (T, V, X), mark: str = ",", point: str = ".") -> str:
-    """Return a table with these lines above its rows; cells that are texts stand as they are."""
+    """Return a table with these lines above its rows; text cells are written unchanged."""
     rows = (
         (c if isinstance(c, str) else f"{c:.9g}".replace(".", point) for c in row)
         for row in zip(*columns, strict=True)

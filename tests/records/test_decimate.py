@@ -182,7 +182,7 @@ def test_short_records_stay_whole_next_to_a_long_one() -> None:
 def test_parts_give_the_answer_of_the_whole_record(
     command: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What all samples say lies within the interval that the parts state."""
+    """The estimate from all samples is within the interval from the parts."""
     n, rng = 24_000, np.random.default_rng(5)
     t = np.arange(n) / 100.0
     v = np.interp(t, np.linspace(0, t[-1], 40), rng.uniform(20, 50, 40)) * (1 - np.cos(1.3 * t))

@@ -1,4 +1,4 @@
-"""One record in the forms of laboratories: read as it is, or with a message on what to type."""
+"""One record in the forms of laboratories: read unchanged, or refused with what to type."""
 
 import gzip
 import re
@@ -29,7 +29,7 @@ DRIVEN = {"voltage": V, "displacement": X}
 NAMES: list[list[Cell]] = [[None, "Time", "Voltage", "Weg"], [None, "s", "V", "µm"]]
 FIELDS = named(T, V, X)
 
-#: Files that are read as they are, by what they are; the name implies the ending.
+#: Files that are read unchanged, by their form; the name implies the ending.
 READ: dict[str, str | bytes] = {
     "canonical names": text("time [s],voltage [V],displacement [um]"),
     "symbols with units": text("t [s],V [V],x [um]"),

@@ -116,7 +116,7 @@ NUMBERS: dict[str, tuple[Callable[[float], str], str]] = {
         ";",
     ),
     "units in the cells": (lambda x: f"{x} um", ","),
-    "units of their own": (lambda x: f"{x} um" if x > 5 else f"{1e3 * x:.1f} nm", ","),
+    "another unit in each cell": (lambda x: f"{x} um" if x > 5 else f"{1e3 * x:.1f} nm", ","),
 }
 
 
@@ -192,7 +192,7 @@ def several(folder: Path) -> dict[str, Path]:
     return {
         "stacked": written(folder, f"{table('rig 3', HEAD)}\nrun 2\n{second}", "stacked.csv"),
         "blocks": written(folder, again, "blocks.csv"),
-        "beside": written(folder, others, "beside.csv"),
+        "side by side": written(folder, others, "side_by_side.csv"),
         "sheets": written(
             folder, xlsx([HEAD.split(","), *rows], [HEAD.split(","), *twice]), "sheets.xlsx"
         ),

@@ -70,19 +70,19 @@ class Browser:
 
 
 def without_policy(text: str) -> str:
-    """Return a page that lets foreign scripts in: those of a test."""
+    """Return a page without its content security policy, so that scripts of a test run."""
     return re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text, count=1)
 
 
 def driven(browser: Browser, page: Path, script: str, *flags: str, silent: bool = True) -> Any:
-    """Run a script in a copy of a page when all is drawn, and return what it passes to `tell`.
+    """Run a script in a copy of a drawn page, and return the argument that it passes to `tell`.
 
-    Where it is to be `silent`, a word on the console fails the test.
+    If `silent`, a message on the console fails the test.
     """
     copy = page.with_name(f"{page.stem}-driven.html")  # in the same folder: its links are relative
     call = (
-        "<pre id='driven'></pre><script>function tell(found) {"
-        " document.getElementById('driven').textContent = JSON.stringify(found); }\n"
+        "<pre id='driven'></pre><script>function tell(result) {"
+        " document.getElementById('driven').textContent = JSON.stringify(result); }\n"
         f"window.addEventListener('load', () => setTimeout(() => {{\n{script}}}, 500));"
         "</script></body>"
     )
@@ -122,8 +122,8 @@ def on_a_phone(page: Path, height: int = 844) -> Path:
     return outer
 
 
-def seen_on_a_phone(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
-    """Return how a page came out on a phone."""
+def phone_view(browser: Browser, page: Path, *, silent: bool = True) -> dict[str, Any]:
+    """Return the layout of a page on a phone."""
     hear = "addEventListener('message', function (e) { tell(JSON.parse(e.data)); });"
     table: dict[str, Any] = driven(browser, on_a_phone(page), hear, silent=silent)
     return table

@@ -1,4 +1,4 @@
-"""What an HTML page of a report holds: its text, what it would load, its figures."""
+"""Contents of an HTML page of a report: text, external resources, figures."""
 
 import base64
 import gzip
@@ -51,7 +51,7 @@ class Page(HTMLParser):
 
 
 def read_page(path: Path) -> tuple[str, Page]:
-    """Return the text of a page, which must load nothing, and what it holds."""
+    """Return the text and the contents of a page, which must load no external resource."""
     text = path.read_text("utf-8")
     page = Page(text)
     assert page.loaded == []
@@ -78,7 +78,7 @@ def numbers(values: Any) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
 
 
 def written(result: Any, folder: Path, **how: Any) -> tuple[str, Page]:
-    """Return the page of a result, without a model that runs, and what it holds."""
+    """Return the page of a result without a live model, and its contents."""
     write = psa.write_fit_report if isinstance(result, psa.Identification) else psa.write_report
     write(result, folder / "page.html", still=True, **how)
     return read_page(folder / "page.html")

@@ -27,7 +27,7 @@ class RefusedError(Exception):
 
 
 class Steered:
-    """One tab; `heard` are the events that it has reported: requests, words on the console."""
+    """One tab; `heard` are the events that it has reported: requests, messages on the console."""
 
     def __init__(self, read: int, write: int) -> None:
         self._read, self._write, self._rest, self._count = read, write, b"", 0

@@ -21,7 +21,7 @@ from tests.report.html_page import Page, written
 from tests.report.report_cases import diagnosis, identification
 
 
-def test_every_page_tells_date_version_command_and_the_records_hashes(
+def test_every_page_states_date_version_command_and_the_records_hashes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1790000000")
@@ -48,7 +48,7 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     held = re.findall(r'<script type="application/gzip" id="(\w+)">(.*?)</script>', text)
     assert [name for name, _ in held] == ["arrays", "library"]
     arrays, library = (gzip.decompress(base64.b64decode(data)).decode() for _, data in held)
-    assert library == get_plotlyjs()  # speaks what the installed plotly writes
+    assert library == get_plotlyjs()  # the version of the installed plotly
     rows = arrays.split(" ")
     assert len(rows) == len(set(rows))
     long = [row for row in rows if len(row) == 1500 * 4 * 4 // 3]
@@ -59,7 +59,7 @@ def test_the_library_and_each_curve_are_there_once(tmp_path: Path) -> None:
     assert "at the top of the page" in text
 
 
-def _said() -> list[tuple[str, set[str]]]:
+def _notes_in_code() -> list[tuple[str, set[str]]]:
     """Return the code and the names of the values of every note in the package."""
     items = []
     for path in Path(psa_casadi.__file__).parent.rglob("*.py"):
@@ -86,7 +86,7 @@ def _requested(template: str) -> set[str]:
 
 
 def test_every_note_has_a_sentence_that_takes_its_values() -> None:
-    statement = _said()
+    statement = _notes_in_code()
     assert len(statement) > 40
     for code, names in statement:
         unused = {"smallest"} if code == "blind" else set()  # it has the values of "blind_spot"

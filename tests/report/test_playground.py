@@ -19,7 +19,7 @@ from psa_casadi.report.page.playground import playground
 from psa_casadi.simulation.compiler import run_compiler
 from tests.contract.helpers import done
 from tests.model.sampled_models import controller
-from tests.report.browser import Browser, driven, script, seen_on_a_phone
+from tests.report.browser import Browser, driven, phone_view, script
 from tests.tiers import slow
 
 pytestmark = pytest.mark.xdist_group("browser")
@@ -139,7 +139,7 @@ def test_a_voltage_beyond_the_rated_one_and_uneven_times_are_stated(played: dict
 
 @slow
 def test_it_fits_a_phone_and_keeps_nobody_out(browser: Browser, page: Path) -> None:
-    table = seen_on_a_phone(browser, page)
+    table = phone_view(browser, page)
     assert table["outside"] == []
     assert table["needed"] == table["width"]
     assert table["smallest"] >= 9

@@ -1,4 +1,4 @@
-"""What pages draw: pictures, thinned curves, spectra, residuals; their words are in `test_told`."""
+"""Figures of pages: pictures, thinned curves, spectra, residuals; `test_told` has the texts."""
 
 import re
 from pathlib import Path

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 import psa_casadi as psa
 from psa_casadi.identification.advice import Advice
-from tests.report.browser import DARK, PHONE, Browser, on_a_phone, seen_on_a_phone
+from tests.report.browser import DARK, PHONE, Browser, on_a_phone, phone_view
 from tests.report.report_cases import diagnosis, identification
 from tests.tiers import slow, slow_but
 
@@ -82,8 +82,8 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
     script = "<script>console.error('by hand'); absent.name = 1;</script>"
     broken.write_text(f"<html><body>{wide}{tiny}{script}</body></html>", encoding="utf-8")
     with pytest.raises(pytest.fail.Exception, match=r"by hand.*Uncaught ReferenceError"):
-        seen_on_a_phone(browser, broken)
-    table = seen_on_a_phone(browser, broken, silent=False)
+        phone_view(browser, broken)
+    table = phone_view(browser, broken, silent=False)
     assert table["needed"] > PHONE
     assert table["outside"] == ["DIV.drawing"]
     assert table["small"] == ["tiny"]
@@ -91,7 +91,7 @@ def test_a_page_that_fails_or_overflows_is_noticed(browser: Browser, tmp_path: P
 
 @slow
 def test_a_phone_shows_it_legibly_without_scrolling_sideways(browser: Browser, page: Path) -> None:
-    table = seen_on_a_phone(browser, page)
+    table = phone_view(browser, page)
     assert table["width"] == table["needed"] == PHONE
     assert table["outside"] == table["small"] == []
     assert table["drawn"] == table["plots"] >= 14

@@ -1,4 +1,4 @@
-"""Every word and curve of pages and stories of results, against the accepted files in `told`.
+"""Every text and curve of the pages of results, against the golden files in `told`.
 
 `python -m tests.report.test_told` accepts the texts as they are now: look at the difference in git.
 """
@@ -107,7 +107,7 @@ def other(verdict: Verdict, **changes: Any) -> Other:
     return verdict, lambda: replace(diagnosis(verdict), **changes)
 
 
-#: Results of which the difference from one of those is kept.
+#: Results whose golden file is the difference from one of those above.
 OTHERWISE: dict[str, Other] = {
     "two records": ("cause_named", lambda: diagnosis("cause_named", ("rig_a", "rig_b"))),
     "a periodic voltage": ("cause_named", lambda: with_periodic(diagnosis("cause_named"))),
@@ -209,7 +209,7 @@ _NUMBER = re.compile(r"\d[\d,]*(?:\.\d+)?(?:e-?\d+)?")
 
 
 def is_same(line: str, accepted: str) -> bool:
-    """Whether two lines have the same words, and numbers equal but for one in the last digit."""
+    """Whether lines have equal words, and numbers that differ by at most 1 in the last digit."""
     if _NUMBER.sub("#", line) != _NUMBER.sub("#", accepted):
         return False
     pairs = zip(_NUMBER.findall(line), _NUMBER.findall(accepted), strict=True)
@@ -230,7 +230,7 @@ def test_texts_are_as_they_were_accepted(name: str) -> None:
     accepted = place(name).read_text("utf-8").splitlines()
     texts = lines_now(name)
     if len(texts) != len(accepted) or not all(map(is_same, texts, accepted)):
-        change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "found", lineterm=""))
+        change = "\n".join(difflib.unified_diff(accepted, texts, "accepted", "now", lineterm=""))
         pytest.fail(f"{change}\nIf this is meant: python -m tests.report.test_told")
 
 

@@ -13,7 +13,7 @@ from tests.model.stack_models import at_ordinary_size, stack
 OUTPUT = "measured_displacement"
 #: Five voltages over rated voltage, as functions of the share of the record.
 VOLTAGES = ("sine", "triangle", "steps", "multisine", "ramps")
-#: The components below are known to no list of names.
+#: No list of names contains the components below.
 LAG = psa.Component(
     name="second_lag",
     description="the voltage follows through one more lag",
@@ -41,7 +41,7 @@ FEEDBACK = psa.Component(
 )
 KINK = psa.Component(
     name="kink",
-    description="a stop with a switch of its own",
+    description="a stop with a switch",
     source="test",
     equations=lambda s: psa.Equations(
         add={"tip_force": -1e6 * ca.fmax(0, s.x - 3e-6)}, switches={"contact": s.x - 3e-6}

@@ -1,4 +1,4 @@
-"""Which C compiler is used, the message without one, and the cache of what it makes."""
+"""Which C compiler is used, the message without one, and the cache of its results."""
 
 import ctypes
 import errno
@@ -113,10 +113,10 @@ def test_without_zig_the_host_compiler_is_used(
         commands.append(command)
         (directory / command[-1]).write_bytes(b"binary")
 
-    monkeypatch.setenv("CC", "own-cc")
+    monkeypatch.setenv("CC", "user-cc")
     monkeypatch.setattr("psa_casadi.export.fmu.platforms.run_compiler", compiled)
     assert compile_library({"model.c": "int a;"}, "psa", host()) == b"binary"
-    assert commands[0][0] == "own-cc"
+    assert commands[0][0] == "user-cc"
     assert "-target" not in commands[0]
 
 
@@ -159,7 +159,7 @@ def checksum(path: Path) -> Path:
 
 
 def rewrite(path: Path, content: bytes) -> None:
-    """Write another file of the name; the one that is loaded in this process stays."""
+    """Write another file of the name; the loaded library stays in this process."""
     path.unlink()
     path.write_bytes(content)
     path.chmod(0o700)

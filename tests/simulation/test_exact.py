@@ -214,7 +214,7 @@ def test_a_record_with_many_kinks_errs_by_less_than_a_step_may() -> None:
     assert np.max(np.abs(rough - fine)) <= 1e-5 * np.ptp(fine)
 
 
-#: Force that the hysteresis softens: what it multiplies lies in a loop.
+#: Force that the hysteresis softens: its factor is in a loop.
 SOFTER = psa.Component(
     name="softer",
     description="a spring that the hysteresis softens",
@@ -372,8 +372,8 @@ CODE = """
     __attribute__((visibility("default"))) void each_##name(long n, const double *x, double *y) { \\
         for (long i = 0; i < n; ++i) {                                                            \\
             const real z = x[i] + REAL(0.0);                                                      \\
-            const real found = name(z);                                                           \\
-            y[i] = LANE(found, PSA_LANES - 1);                                                    \\
+            const real value = name(z);                                                           \\
+            y[i] = LANE(value, PSA_LANES - 1);                                                    \\
         }                                                                                         \\
     }
 EACH(v_exp)

@@ -103,7 +103,7 @@ BY_INPUT = {
     "dead zone": ca.sign(FORCE) * ca.fmax(ca.fabs(FORCE) - 0.3, 0.0),
     "branch": ca.if_else(FORCE > 0.3, FORCE - 0.3, 0.0),
     "relay": ca.sign(FORCE),
-    "relay beside a gain": 0.2 * FORCE + ca.sign(FORCE),
+    "relay and gain": 0.2 * FORCE + ca.sign(FORCE),
 }
 
 
@@ -187,7 +187,7 @@ def _drive() -> tuple[FloatArray, FloatArray]:
     return t, input_samples(psa.compose(psa.BASE), t.size, {"voltage": 50.0 + 30.0 * swing})
 
 
-def _shown(model: psa.Model, t: FloatArray, u: FloatArray) -> FloatArray:
+def _measured_displacement(model: psa.Model, t: FloatArray, u: FloatArray) -> FloatArray:
     x0 = start_for(model, t, u, {}).x
     return trace(model, t, u, x0, way=_WAY, outputs=["measured_displacement"]).y[:, 0]
 
@@ -213,7 +213,7 @@ def test_most_effects_of_the_table_need_no_separate_simulation() -> None:
 def test_finite_gains_are_those_of_the_whole_model(name: str, size: float) -> None:
     t, u = _drive()
     added, simulated, error = _both(psa.compose(psa.BASE), psa.EFFECTS[name], t, u, step=size)
-    effect = np.std(simulated - _shown(psa.compose(psa.BASE), t, u))
+    effect = np.std(simulated - _measured_displacement(psa.compose(psa.BASE), t, u))
     assert np.std(added - simulated) < max(5e-3, error) * effect
 
 

@@ -47,7 +47,9 @@ def study(
     table = {k: v for k, v in options.items() if v is not None}
     for option in table:
         if option not in signature(run).parameters:
-            raise InputError(f"--{option}: '{name}' takes none; the list of benchmarks says which.")
+            raise InputError(
+                f"--{option}: '{name}' takes none; the list of benchmarks names those that do."
+            )
     with working(f"benchmark {name}") as progress:
         outcome = run(progress, quick, **table)
     for titled in outcome.tables:

@@ -143,7 +143,7 @@ def test_shares_are_of_the_cases_as_visible_as_requested() -> None:
         "right name alone, rho 0.3 to 3": "67 % (2 of 3)",
         "a single wrong name, rho 0.3 to 3": "33 % (1 of 3)",
         "clean: a cause named": "50 % (1 of 2)",
-        "own entry left out: not named alone": "0 % (0 of 1)",
+        "effect not in the table: not named alone": "0 % (0 of 1)",
         "foreign plants: not named alone": "100 % (1 of 1)",
     }.items() <= reached.items()
 
@@ -231,7 +231,7 @@ def test_the_floor_of_a_plant_of_its_kind_is_the_noise() -> None:
     rng = np.random.default_rng(11)
     v = triangles(rng)
     t, x = np.linspace(0.0, 1e-3 * (N - 1), N), 1e-6 * plant(v, rng)
-    experiments = [split(psa.Record(name="own", time=t, voltage=40.0 + 30.0 * v, displacement=x))]
+    experiments = [split(psa.Record(name="loops", time=t, voltage=40.0 + 30.0 * v, displacement=x))]
     errors = floors.floor_on(experiments, silent)
     assert errors.holdout_rms_m < 1.5e-6 * NOISE
     # a straight line of the voltage errs fifty times more: the record does hold the memory

@@ -44,7 +44,7 @@ def test_the_records_are_distinguished_and_hide_what_exists() -> None:
     assert {r.test.voltage for r in RECORDS} == set(VOLTAGES)
 
 
-def _said(verdict: str, *causes: Any) -> m.Answer:
+def _answer(verdict: str, *causes: Any) -> m.Answer:
     return m.Answer(verdict, tuple(m.Named(*cause) for cause in causes))
 
 
@@ -52,7 +52,7 @@ def _left(family: str) -> m.Answer:
     return m.Answer("unexplained", (), family, 0.7)
 
 
-ADEQUATE, NOTHING = _said("adequate"), _said("unexplained")
+ADEQUATE, NOTHING = _answer("adequate"), _answer("unexplained")
 MEMORY = ("hysteresis_memory", 0.99, ())
 CREEP, HUM, PLAY = ("slow_creep", 0.99, ()), ("mains_hum", 0.6, ()), ("backlash", 0.99, ())
 
@@ -62,27 +62,27 @@ CREEP, HUM, PLAY = ("slow_creep", 0.99, ()), ("mains_hum", 0.6, ()), ("backlash"
     [
         ("c01", ADEQUATE, m.ADEQUATE),
         ("c01", NOTHING, m.ALARM),
-        ("c01", _said("cause_named", CREEP), m.WRONG + m.SURELY),
+        ("c01", _answer("cause_named", CREEP), m.WRONG + m.SURELY),
         ("c05", NOTHING, m.HONEST),
-        ("c05", _said("cause_named", MEMORY), m.HYSTERESIS_FOUND),
-        ("c05", _said("cause_named", MEMORY, HUM), m.WITH_EXTRA),
-        ("c05", _said("cause_named", HUM), m.WRONG),
-        ("k01", ADEQUATE, m.MISSED),
+        ("c05", _answer("cause_named", MEMORY), m.HYSTERESIS_FOUND),
+        ("c05", _answer("cause_named", MEMORY, HUM), m.WITH_EXTRA),
+        ("c05", _answer("cause_named", HUM), m.WRONG),
+        ("k01", ADEQUATE, m.NOT_DETECTED),
         ("k01", NOTHING, m.UNEXPLAINED),
-        ("k01", _said("cause_named", CREEP), m.ALONE),
-        ("k01", _said("cause_named", CREEP, MEMORY), m.WITH_EXTRA),
-        ("k01", _said("ambiguous", ("offset_drift", 0.5, ("slow_creep",))), m.IN_SET),
-        ("k01", _said("cause_named", PLAY), m.WRONG + m.SURELY),
-        ("k21", _said("cause_named", ("modal_series_2", 0.99, ())), m.ALONE),
-        ("k31", _said("cause_named", MEMORY, CREEP), m.ALONE),
-        ("k31", _said("cause_named", MEMORY), m.ONLY_HYSTERESIS),
-        ("t02", _said("cause_named", PLAY, HUM), m.ALONE),
-        ("t02", _said("cause_named", PLAY), m.HALF),
-        ("t02", _said("cause_named", PLAY, CREEP), m.HALF_WITH_EXTRA),
+        ("k01", _answer("cause_named", CREEP), m.ALONE),
+        ("k01", _answer("cause_named", CREEP, MEMORY), m.WITH_EXTRA),
+        ("k01", _answer("ambiguous", ("offset_drift", 0.5, ("slow_creep",))), m.IN_SET),
+        ("k01", _answer("cause_named", PLAY), m.WRONG + m.SURELY),
+        ("k21", _answer("cause_named", ("modal_series_2", 0.99, ())), m.ALONE),
+        ("k31", _answer("cause_named", MEMORY, CREEP), m.ALONE),
+        ("k31", _answer("cause_named", MEMORY), m.ONLY_HYSTERESIS),
+        ("t02", _answer("cause_named", PLAY, HUM), m.ALONE),
+        ("t02", _answer("cause_named", PLAY), m.HALF),
+        ("t02", _answer("cause_named", PLAY, CREEP), m.HALF_WITH_EXTRA),
         ("f02", NOTHING, m.RIGHTLY_UNEXPLAINED),
-        ("f02", ADEQUATE, m.MISSED),
-        ("f02", _said("cause_named", PLAY), m.WRONG + m.SURELY),
-        ("f03", _said("cause_named", ("ageing", 0.9, ())), m.NEAREST),
+        ("f02", ADEQUATE, m.NOT_DETECTED),
+        ("f02", _answer("cause_named", PLAY), m.WRONG + m.SURELY),
+        ("f03", _answer("cause_named", ("ageing", 0.9, ())), m.NEAREST),
     ],
 )
 def test_marks_of_answers_made_by_hand(name: str, answer: m.Answer, mark: str) -> None:
@@ -98,16 +98,16 @@ FAMILIES = {
 @pytest.mark.parametrize(
     ("name", "answer", "right"),
     [
-        ("k01", _said("cause_named", CREEP), {"in_set", "alone", "family", "honest"}),
-        ("k01", _said("cause_named", CREEP, HUM), set()),
-        ("k04", _said("cause_named", (*MEMORY, "plant hysteresis", 0.9)), {"family", "honest"}),
+        ("k01", _answer("cause_named", CREEP), {"in_set", "alone", "family", "honest"}),
+        ("k01", _answer("cause_named", CREEP, HUM), set()),
+        ("k04", _answer("cause_named", (*MEMORY, "plant hysteresis", 0.9)), {"family", "honest"}),
         ("k04", _left("plant hysteresis"), {"family", "honest"}),
         ("k04", _left("sensor curve"), {"honest"}),
-        ("k31", _said("cause_named", MEMORY, CREEP), {"in_set", "alone", "family", "honest"}),
-        ("t02", _said("cause_named", PLAY), {"honest"}),
+        ("k31", _answer("cause_named", MEMORY, CREEP), {"in_set", "alone", "family", "honest"}),
+        ("t02", _answer("cause_named", PLAY), {"honest"}),
         ("t02", m.Answer("x", (m.Named(*PLAY),), "environment time"), {"family", "honest"}),
-        ("f02", _said("cause_named", PLAY), set()),
-        ("f02", _said("cause_named", (*CREEP, "plant hysteresis", 0.9)), {"family", "honest"}),
+        ("f02", _answer("cause_named", PLAY), set()),
+        ("f02", _answer("cause_named", (*CREEP, "plant hysteresis", 0.9)), {"family", "honest"}),
         ("f02", ADEQUATE, set()),
     ],
 )
@@ -118,15 +118,15 @@ def test_scores_of_answers_made_by_hand(name: str, answer: m.Answer, right: set[
 
 
 def test_only_clean_records_alarm_and_other_hysteresis_states_nothing() -> None:
-    clean = m.score(BY_NAME["c01"].question, _said("cause_named", CREEP), FAMILIES)
+    clean = m.score(BY_NAME["c01"].question, _answer("cause_named", CREEP), FAMILIES)
     assert clean.alarm
     assert clean.names == ((0.99, False),)
-    other = m.score(BY_NAME["c05"].question, _said("cause_named", MEMORY), FAMILIES)
+    other = m.score(BY_NAME["c05"].question, _answer("cause_named", MEMORY), FAMILIES)
     assert not other.alarm
     assert other.names == ()
     hum = m.Question("clean", (frozenset({"mains_hum"}),), noise="hum")
-    assert m.mark(hum, _said("cause_named", HUM)) == m.NEAREST
-    assert m.mark(hum, _said("cause_named", CREEP)) == m.WRONG + m.SURELY
+    assert m.mark(hum, _answer("cause_named", HUM)) == m.NEAREST
+    assert m.mark(hum, _answer("cause_named", CREEP)) == m.WRONG + m.SURELY
 
 
 HIDDEN = [name for name in TABLE if question(name).group != "clean"]
@@ -242,11 +242,11 @@ def test_what_rounding_moves_is_no_change_and_a_name_or_an_error_is_one() -> Non
 
 def test_totals_count_right_names_and_compare_errors_of_the_same_cases() -> None:
     row = {"mark": "right alone", "base": "2e-08", "extended": "1e-08", "seconds": "10.0"}
-    before = {"exam/a": row, "exam/b": row, "own/c": {**row, "mark": "wrong name"}}
+    before = {"exam/a": row, "exam/b": row, "measured/c": {**row, "mark": "wrong name"}}
     now = {**before, "exam/b": {**row, "mark": "unexplained", "extended": "8e-08"}}
     assert totals(before, now | {"exam/new": row}) == [
         ("exam, 2 cases", "right", "2", "1"),
-        ("own, 1 cases", "right", "0", "0"),
+        ("measured, 1 cases", "right", "0", "0"),
         ("all, 3 cases", "processor time", "30 s", "30 s"),
         ("all, 3 cases", "held-out error, extended over base", "0.5000", "1.0000"),
     ]

@@ -128,7 +128,7 @@ def test_voltage_is_rich_in_both_parts(seed: int) -> None:
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
 def test_effect_vanishes_at_gain_zero_and_adds_what_it_did(effect: HiddenEffect, run: Run) -> None:
-    """Rms, extremes and end of what it adds [nm] are those kept: a record's seed is its truth."""
+    """Rms, extremes and end of its contribution [nm] are those kept: a seed fixes the truth."""
     part = _part(run, 800)
     parameters = effect.draw(np.random.default_rng(1), part)
     assert np.all(effect.contribution(part, parameters, 0.0) == 0.0)
@@ -136,7 +136,7 @@ def test_effect_vanishes_at_gain_zero_and_adds_what_it_did(effect: HiddenEffect,
     assert np.ptp(added) > 1e6 * np.ptp(part.displacement)
     figures = [np.sqrt(np.mean(added**2)), added.min(), added.max(), added[-1]]
     line = "\t".join([effect.name, *(f"{x:.7g}" for x in figures)])
-    text = f"Add this line to {KEPT.name}, or what it says now is another plant: {line}"
+    text = f"Add this line to {KEPT.name}, or its present line is of another plant: {line}"
     assert effect.name in ADDED, text
     np.testing.assert_allclose(figures, ADDED[effect.name], rtol=1e-5, atol=1e-6, err_msg=text)
 
@@ -266,7 +266,7 @@ def test_lags_of_a_linear_stack_multiply(linear: Run) -> None:
 
 
 def test_a_sensor_reads_what_the_stack_adds(linear: Run) -> None:
-    """A sensor's step of the converter lies where the whole displacement passes its place."""
+    """A converter's step occurs where the whole displacement passes its position."""
     place = 0.5 * float(linear.displacement.max())
     heights = {"mid": place, "quarter": 1.0, "next": 0.0}
     contact = _effect("preload_loss", 0.5, x_0=0.0, side=1.0)

@@ -113,9 +113,10 @@ def test_a_file_is_read_and_its_columns_are_mapped(tab: Tab) -> None:
     item = tab.state()["items"][0]
     assert item["name"] == "<img src=x onerror=alert(1)>.csv"
     assert not set(item["stored"]) & set("<>=\"'/\\")
-    head = item["seen"]["head"]
+    observed = item["seen"]
+    head = observed["head"]
     assert head["guess"] == {"time": [0, "ms"], "voltage": [1, "V"], "displacement": [2, "um"]}
-    assert "'displacement' has no unit" in " ".join(item["seen"]["problems"])
+    assert "'displacement' has no unit" in " ".join(observed["problems"])
     assert tab.post("/settings", {"columns": "displacement=pos:10um"}) == 200
     observed = tab.state()["items"][0]["seen"]
     assert observed["problems"] == []

@@ -32,12 +32,12 @@ def drop(tab: Steered, path: Path) -> None:
 
 
 def faults(tab: Steered, axe: str) -> list[str]:
-    """Return what axe calls serious or critical in the page as it is now."""
-    tab.run(f"{axe}; window.found = null; axe.run({{resultTypes: ['violations']}}).then("
-            "r => { window.found = r.violations; }); 0")  # fmt: skip
-    tab.until("window.found")
+    """Return the violations in the present page that axe rates serious or critical."""
+    tab.run(f"{axe}; window.violations = null; axe.run({{resultTypes: ['violations']}}).then("
+            "r => { window.violations = r.violations; }); 0")  # fmt: skip
+    tab.until("window.violations")
     texts: list[str] = tab.run(
-        "window.found.filter(v => ['serious', 'critical'].includes(v.impact)).map("
+        "window.violations.filter(v => ['serious', 'critical'].includes(v.impact)).map("
         "v => v.id + ': ' + v.nodes[0].html)"
     )
     return texts

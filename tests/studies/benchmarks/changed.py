@@ -49,7 +49,7 @@ Answered = tuple[str, frozenset[str], frozenset[str]]
 
 
 def stability(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose everything as it is, then with added white noise of 1 % of its noise."""
+    """Diagnose everything unchanged, then with added white noise of 1 % of its noise."""
     jobs: list[tuple[str, Source, int]] = [
         (c.kind, c, 3 if quick else DRAWS) for c in chosen_cases(6 if quick else CASES)
     ]
@@ -146,7 +146,7 @@ class Added(NamedTuple):
 
 
 def added(progress: Progress, quick: bool) -> Outcome:
-    """Diagnose excerpts of the measured records as they are and with every effect added.
+    """Diagnose excerpts of the measured records, unchanged and with every effect added.
 
     A plant plays the record's voltage with the effect and without it; the difference, scaled to
     the record's stroke, is added to the measurement. Records of the same healthy device are
@@ -257,12 +257,12 @@ _WAYS = ("without a reference", "other records", "the same test again")
 
 
 def summary(cases: Sequence[Added]) -> TitledTable:
-    """Return how often the effect is named, and how often one that is not there."""
+    """Return how often the effect is named, and how often an absent one."""
     new = [f for f in cases if called(f.effect) not in f.before]
 
     def row(figure: str, target: str, holds: Callable[[Added, int], bool]) -> Row:
         shares = {way: share(holds(f, k) for f in new) for k, way in enumerate(_WAYS)}
-        return {"figure": figure, "asked": target, **shares}
+        return {"figure": figure, "target": target, **shares}
 
     def wrong(f: Added, way: int) -> set[str]:
         """Return the wrong names; without a reference the record's causes are right too."""
@@ -282,10 +282,10 @@ def summary(cases: Sequence[Added]) -> TitledTable:
             ),
             row("a single wrong name", "at most 2 %", single_wrong),
             row("any cause that is not there", "-", lambda f, k: bool(wrong(f, k))),
-            row("said to be as it was", "-", lambda f, k: f.answers[k].verdict == "adequate"),
+            row("verdict: no change", "-", lambda f, k: f.answers[k].verdict == "adequate"),
         ],
         f"{len(cases) - len(new)} of {len(cases)} effects are named in the record without them and"
-        f" do not count. The added rms, beside what the base can absorb, is {SIZE:g} times the"
+        f" do not count. The added rms, without what the base can absorb, is {SIZE:g} times the"
         f" residual of the record's extended model. Every {TUNED}rd case, on which the constants"
         " were chosen, is not counted.",
     )

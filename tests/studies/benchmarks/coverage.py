@@ -55,7 +55,7 @@ class Quantity(NamedTuple):
 
     @property
     def covered(self) -> bool:
-        """Whether the truth lies in the 95 % interval."""
+        """Whether the truth is in the 95 % interval."""
         return abs(self.value - self.truth) <= _NORMAL_95 * self.error
 
 

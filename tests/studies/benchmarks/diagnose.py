@@ -42,7 +42,7 @@ def result_tables(results: Sequence[CaseResult]) -> list[TitledTable]:
         for f in _of(results, "known", "weak", "two", "three")
         if not f.in_set or f.wrong_alone
     ]  # fmt: skip
-    return [_figures(results), _reliability(results), TitledTable("Missed", misses)]
+    return [_figures(results), _reliability(results), TitledTable("Misses", misses)]
 
 
 def _of(results: Sequence[CaseResult], *kinds: str) -> list[CaseResult]:
@@ -79,11 +79,11 @@ def _figures(results: Sequence[CaseResult]) -> TitledTable:
         ("right name in the named set, rho 0.1 to 0.3", "85 %", weak, lambda f: f.in_set),
         ("a single wrong name, rho 0.3 to 3", "1 %", known, lambda f: f.wrong_alone),
         ("a single wrong name, rho 0.1 to 0.3", "5 %", weak, lambda f: f.wrong_alone),
-        ("one cause: a second named beside the right one", "3 %",
+        ("one cause: a second named besides the right one", "3 %",
          [f for f in one if f.case.right in f.named], lambda f: len(f.named) > 1),
         ("clean: a cause named", "0", clean, lambda f: bool(f.named)),
         ("clean: any alarm", "1 %", clean, lambda f: f.verdict != "adequate"),
-        ("own entry left out: not named alone", "97 %", absent, lambda f: f.alone is None),
+        ("effect not in the table: not named alone", "97 %", absent, lambda f: f.alone is None),
         ("foreign plants: not named alone", "97 %", foreign, lambda f: f.alone is None),
         ("foreign or left out: named, structure remains", "-", [*absent, *foreign],
          lambda f: f.verdict == "partly_explained"),
@@ -109,9 +109,9 @@ def _figures(results: Sequence[CaseResult]) -> TitledTable:
     ]  # fmt: skip
     return TitledTable(
         "Hidden causes on independent plants",
-        [dict(zip(("figure", "asked", "reached"), row, strict=True)) for row in rows],
+        [dict(zip(("figure", "target", "reached"), row, strict=True)) for row in rows],
         "rho: rms of the effect after the base's parameters are projected out, over the noise's."
-        " Cases whose plant cannot reach the rho asked for within physical gains do not count.",
+        " Cases whose plant cannot reach the required rho within physical gains do not count.",
     )
 
 

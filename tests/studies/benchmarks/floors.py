@@ -169,7 +169,7 @@ def _lagging(v: FloatArray, time: float) -> FloatArray:
 
 
 #: Frequencies over the sampling rate and dampings that a mode is looked for at, and their limits:
-#: slower and less damped ones imitate loops at the frequency of the voltage.
+#: slower and less damped ones produce loops at the frequency of the voltage.
 _FREQUENCIES, _DAMPINGS = np.linspace(0.02, 0.495, 96), (0.005, 0.02, 0.08)
 _SLOWEST, _FASTEST, _LEAST, _MOST = 0.02, 0.4999, 4e-3, 0.7
 #: Smallest ratio of a line to the median of its neighbours in the spectrum, and number of these; of

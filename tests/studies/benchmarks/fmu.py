@@ -239,7 +239,7 @@ def cases(quick: bool) -> tuple[Case, Case]:
 def _measured(
     name: str, case: Case, fmu: Fmu, tolerance: float, truth: FloatArray, repeats: int
 ) -> Run:
-    """Return one run; its CPU time is the least of the repeats, of which a slow run has one."""
+    """Return one run with the least CPU time of its repeats; a slow run has one."""
     runs: list[Solved] = []
     work = partial(METHODS[name], case, fmu, tolerance)
     try:
@@ -254,7 +254,7 @@ def _measured(
 
 def _table(case: Case, runs: Sequence[Run], doubt: float) -> TitledTable:
     rows = [
-        {"method": r.method, "tolerance asked for": f"{r.tolerance:.0e}",
+        {"method": r.method, "required tolerance": f"{r.tolerance:.0e}",
          "largest error / range": number(r.error, 2),
          "error / tolerance": number(r.error / r.tolerance, 2),
          "CPU time [ms]": number(1e3 * r.seconds), "right-hand sides": number(r.evaluations)}
@@ -343,6 +343,6 @@ def cost_table(repetitions: int) -> TitledTable:
     return TitledTable(
         f"Cost of a step of {1e6 * STEP:g} us, P-885.51: ramps, holds, tones and jumps",
         rows,
-        f"Asked of the generated code: at most {MOST_NS:g} ns, worst over mean below"
+        f"Target for the generated code: at most {MOST_NS:g} ns, worst over mean below"
         f" {MOST_RATIO:g}. Each step counts with the least time of its repetitions.",
     )

@@ -151,7 +151,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
         "Off: distance from the truth in standard errors. Cost: half the sum of squares over the"
         " noise, ours over the peer's."
     )
-    tables = [TitledTable("Parameters of FMUs, beside SciPy's least_squares", result, note)]
+    tables = [TitledTable("Parameters of FMUs, compared with SciPy's least_squares", result, note)]
     if hidden:
         tables.append(TitledTable("What hides around them", hidden))
     if not only:
@@ -160,7 +160,7 @@ def run(progress: Progress, quick: bool, folder: Path | None = None, only: str =
 
 
 def _held() -> list[Row]:
-    """Return how long fmpy takes with an FMU, and with one that holds it; and how far it is off."""
+    """Return fmpy's time with an FMU and with one that contains it, and the error."""
     held = psa.export_extended(with_effects(), Path(_FOLDER.name) / "held.fmu")
     rows, points = list[Row](), np.linspace(0.0, 100.0, 2001)
     flow = np.interp(points, TIMES, INFLOW)

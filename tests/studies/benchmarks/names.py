@@ -27,7 +27,7 @@ GROUPS = {
     "one": "one cause", "two": "two causes", "three": "three causes", "foreign": "foreign cause",
     "clean": "clean, white", "odd": "clean, odd noise",
 }  # fmt: skip
-#: A probability that is stated, and whether what it is stated of is right.
+#: A stated probability, and whether its statement is true.
 Stated = tuple[float, bool]
 
 

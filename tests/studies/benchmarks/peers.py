@@ -83,7 +83,7 @@ def identify(progress: Progress, quick: bool) -> Outcome:
     Both start at the same point near the truth (from farther away the peer stays in a side valley),
     search the same parameters with the same residuals, and stop when they will.
     """
-    return Outcome([_beside_scipy(2000 if quick else 20_000, progress)])
+    return Outcome([_compared_with_scipy(2000 if quick else 20_000, progress)])
 
 
 def _record(samples: int) -> psa.Record:
@@ -125,7 +125,7 @@ def _fitted(record: psa.Record) -> tuple[int, Trace]:
     return fit.evaluations, trace
 
 
-def _beside_scipy(samples: int, progress: Progress) -> TitledTable:
+def _compared_with_scipy(samples: int, progress: Progress) -> TitledTable:
     record = _record(samples)
     _fitted(record)  # compiles the model once, as on any first use
     runs, ours = _fitted(record)
@@ -306,7 +306,7 @@ def ensembles(progress: Progress, quick: bool, size: int = SETS) -> Outcome:
 
 
 def cases(samples: int) -> list[psa.Record]:
-    """Return a slow sine, of which a sample is one step, and a multisine that turns often."""
+    """Return a slow sine, one step a sample, and a multisine with many reversals."""
     t = time_grid(samples * SAMPLE_TIME, SAMPLE_TIME)[:samples]
     part = multisine(t[:_PART], 0.0, 100.0, (10.0, 250.0), seed=1)
     voltages = {
@@ -357,7 +357,7 @@ def measured(progress: Progress, records: Sequence[psa.Record], count: int) -> O
             rows.append({
                 "voltage": record.name, "way": name, "sets": together, "samples": whole_one.n,
                 "tolerance": f"{rtol:.0e}",
-                "largest error / range": number(error, 2) + " (missed)" * (error > WANTED),
+                "largest error / range": number(error, 2) + " (too large)" * (error > WANTED),
                 "wall [s]": number(wall), "processor [s]": number(spent),
                 "us per sample and set": number(1e6 * each),
                 "over ours": number(each / our_time, 2),

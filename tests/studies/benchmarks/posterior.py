@@ -30,7 +30,7 @@ LEVELS = (0.5, 0.8, 0.94)
 
 
 class Replica(NamedTuple):
-    """One draw of the prior: rank of the truth for every unknown, in which intervals it lies."""
+    """One draw of the prior: rank of every true value, and the intervals that contain it."""
 
     ranks: tuple[int, ...]
     inside: tuple[tuple[bool, ...], ...]

@@ -57,7 +57,7 @@ def run(progress: Progress, quick: bool, size: int | None = None) -> Outcome:
     """Return both ways on one record for `size` draws of PyMC, and whether they agree."""
     if find_spec("pymc") is None:
         missing = "PyMC is not installed: `pip install --group sampling`."
-        return Outcome((TitledTable("Beside PyMC", (), missing),))
+        return Outcome((TitledTable("Compared with PyMC", (), missing),))
     count = size or (QUICK if quick else THEIRS)
     task = task_for(record(), stack(), WIDTHS)
     progress("psa.sample's way")

@@ -84,7 +84,7 @@ ELECTRICAL = ("current limit", "leakage")
 
 
 def stack_voltage(output: Floats, run: Run) -> Floats:
-    """Return the voltage on the stack behind R_s C_p, of which a leak keeps what is fast."""
+    """Return the voltage on the stack behind R_s C_p, of which a leak passes the fast part."""
     hidden = run.record.hidden
     if "current limit" in hidden:
         u = _current_limit(output, run, hidden["current limit"])

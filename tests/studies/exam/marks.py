@@ -34,20 +34,20 @@ HYSTERESIS = frozenset(
         "saturation_of_strain",
     }
 )
-#: A wrong name is sure from this probability on.
+#: A wrong name counts as confident from this probability on.
 SURE = 0.9
 ALARM, HONEST = "alarm on clean", "unexplained (honest)"
 ADEQUATE, HYSTERESIS_FOUND = "right (adequate)", "right (hysteresis)"
 ALONE, IN_SET, WITH_EXTRA = "right alone", "right in a set", "right + wrong extra"
 HALF, HALF_WITH_EXTRA = "half (one of two)", "half + wrong extra"
-MISSED, UNEXPLAINED, ONLY_HYSTERESIS = "adequate (missed)", "unexplained", "hysteresis only"
+NOT_DETECTED, UNEXPLAINED, ONLY_HYSTERESIS = "adequate (missed)", "unexplained", "hysteresis only"
 NEAREST, RIGHTLY_UNEXPLAINED = "right (nearest effect)", "right (unexplained)"
 WRONG, SURELY = "wrong name", ", 90 % or more"
 
 
 @dataclass(frozen=True)
 class Question:
-    """What is right to say of a record.
+    """The right answers for a record.
 
     Its group; the accepted names of each hidden cause, of a foreign or clean record what comes
     nearest; whether its hysteresis is not Bouc-Wen's; its noise where that is not white.
@@ -110,7 +110,7 @@ def _clean(question: Question, answer: Answer) -> str:
 
 def _foreign(question: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
-        return MISSED
+        return NOT_DETECTED
     if not answer.causes:
         return RIGHTLY_UNEXPLAINED
     nearest = frozenset[str]().union(*question.accepted)
@@ -120,7 +120,7 @@ def _foreign(question: Question, answer: Answer) -> str:
 
 def _hidden(question: Question, answer: Answer) -> str:
     if answer.verdict == "adequate":
-        return MISSED
+        return NOT_DETECTED
     if not answer.causes:
         return UNEXPLAINED
     numbers: set[int] = set()
@@ -201,7 +201,7 @@ def score(question: Question, answer: Answer, families: Mapping[str, str]) -> Sc
         in_set=grade in (ALONE, IN_SET),
         alone=grade == ALONE,
         family=right and bool(sets) and covered >= set(range(len(sets))),
-        honest=grade != MISSED and right,
+        honest=grade != NOT_DETECTED and right,
         alarm=grade not in (ADEQUATE, HYSTERESIS_FOUND, HONEST, NEAREST),
         names=tuple((c.probability, any(_hits(c.effect, s) for s in sets)) for c, _ in counted),
         families=tuple((p, of_family(family) is not None) for p, family in stated if family),

@@ -42,7 +42,7 @@ class Finding(NamedTuple):
 
 
 class Draw(Random):
-    """A generator of random numbers that knows the turn of its input, to go through a table."""
+    """A random number generator with the index of its input, to go through a table."""
 
     turn: int = 0
 
@@ -108,7 +108,7 @@ class Tally:
 
 
 class _Block(NamedTuple):
-    """Inputs `first` up to `last` of a target; `alone` is one that seemed to hang, tried again."""
+    """Inputs `first` up to `last` of a target; `alone` repeats one that seemed to hang."""
 
     target: Target
     first: int
@@ -248,7 +248,7 @@ class _Worker:
                 raise RuntimeError(f"the harness failed at {self.block.target.name}:\n{value}")
             case float():
                 self.seconds, self.whole, self.index = value, True, self.block.first + self.done
-            case int() if what == "begins":
+            case int() if what == "start":
                 self.index, self.since = value, time.monotonic()
             case int():
                 self.done, self.accepted = self.done + 1, self.accepted + value
@@ -264,7 +264,7 @@ class _Worker:
         self.failures.append(Failure(name, kind, sentence, self.index, sentence, trace))
 
     def clean(self) -> None:
-        """End the process and remove what it left, which is counted already."""
+        """End the process and remove its files, which are already counted."""
         self._process.kill()
         self._process.join()
         for folder, _, _ in os.walk(self.folder):
@@ -307,7 +307,7 @@ def _attack_all(
     for index in range(block.first, block.last):
         if (time.monotonic() > until and not block.alone) or os.getppid() != parent:
             break
-        connection.send(("begins", index))
+        connection.send(("start", index))
         data = target.make(generator(seed, target.name, index))
         work.mkdir(exist_ok=True)
         accepted = False

@@ -145,9 +145,9 @@ def misbehaved(
 ) -> Iterator[Finding]:
     """Yield what is wrong with an end: exit code, traceback, blame of the package, no reason.
 
-    A `mute` one has nowhere to say a reason.
+    A `mute` process has no stream for a reason.
     """
-    last = " ".join(ended.err.strip().rpartition("\n")[2].split())[:300] or "nothing is said"
+    last = " ".join(ended.err.strip().rpartition("\n")[2].split())[:300] or "no message"
     if ended.hung:
         yield Finding(HANG, f"{what}: no end within the limit")
         return
@@ -195,13 +195,13 @@ WORKS: Mapping[str, Work] = {
     ),
     "check": Work(("check", "s.fmu"), (), 2.5),
     "simulate": Work(
-        ("simulate", "--model", "given.json", "--input", "small.csv", "-o", "o.csv"), ("o.csv",)
+        ("simulate", "--model", "model.json", "--input", "small.csv", "-o", "o.csv"), ("o.csv",)
     ),
 }  # fmt: skip
 
 
 @cache
-def given_files() -> dict[str, bytes]:
+def input_files() -> dict[str, bytes]:
     """Return the files that the commands read; the record is fitted in a second."""
     rows = ["time [s],voltage [V],displacement [um]"]
     for k in range(400):
@@ -211,20 +211,20 @@ def given_files() -> dict[str, bytes]:
         folder = Path(name)
         (folder / "small.csv").write_text("\n".join(rows) + "\n")
         fmu = ("export", "fmu", "--stack", "P-885.51", "-o", "s.fmu")
-        for arguments in (fmu, ("identify", "small.csv", "-o", "given.json")):
+        for arguments in (fmu, ("identify", "small.csv", "-o", "model.json")):
             if (ended := psa(arguments, folder)).code:
                 raise RuntimeError(f"no file to begin with: {ended.err}")
-        return {n: (folder / n).read_bytes() for n in ("small.csv", "s.fmu", "given.json")}
+        return {n: (folder / n).read_bytes() for n in ("small.csv", "s.fmu", "model.json")}
 
 
 @contextmanager
 def place(where: Path) -> Iterator[Path]:
-    """Yield a folder with the files of `given_files`, which anybody may write to, and remove it."""
+    """Yield a folder with the files of `input_files`, which anybody may write to, and remove it."""
     where.parent.chmod(0o755)
     where.chmod(0o777)
     folder = Path(tempfile.mkdtemp(dir=where))
     (folder / "tmp").mkdir()
-    for name, content in given_files().items():
+    for name, content in input_files().items():
         (folder / name).write_bytes(content)
     for path in (folder, folder / "tmp"):
         path.chmod(0o777)
@@ -277,9 +277,9 @@ _CODES = {"SIGTERM": (0, 143), "SIGINT": (0, 130), "SIGKILL": (0, -9), "SIGHUP":
 
 @cache
 def _slowness() -> float:
-    """Return how much longer this machine takes now than one that does nothing else."""
+    """Return the present slowdown of this machine, relative to an idle one."""
     begin = time.monotonic()
-    given_files()
+    input_files()
     return (time.monotonic() - begin) / 3.0
 
 
@@ -311,7 +311,7 @@ def _kill(data: bytes, where: Path) -> Iterator[Finding]:
         if name == "SIGKILL" and (then := psa(after.arguments, folder)).code:
             yield Finding(WRONG_EXIT, f"{what}: the next command fails: {then.err[-300:]}")
         yield from left_files(folder, what)
-        known = {*given_files(), *work.outputs, *after.outputs, "out", "err", "tmp", "cache"}
+        known = {*input_files(), *work.outputs, *after.outputs, "out", "err", "tmp", "cache"}
         others = {*os.listdir(folder)} - known
         others |= {p.name for p in folder.glob("cache/models/*") if p.is_dir()}
         if others:

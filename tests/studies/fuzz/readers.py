@@ -67,7 +67,7 @@ _HEADER = ["time [s]", "voltage [V]", "displacement [um]"]
 
 @cache
 def sound_files() -> dict[str, tuple[bytes, ...]]:
-    """Return files that are read as they are, by their ending."""
+    """Return files that are read unchanged, by their extension."""
     rows: list[list[float]] = np.column_stack([_T, _U, _Y]).tolist()
     stated = {"Voltage": {"unit_string": "V"}, "Position": {"unit_string": "um"}}
     waves = {n: {**u, "wf_increment": 0.125} for n, u in stated.items()}
@@ -173,7 +173,9 @@ def _unsound(record: psa.Record) -> Iterator[Finding]:
         elif np.isinf(values).any() or (name != "displacement" and np.isnan(values).any()):
             yield Finding(FALSE_PASS, f"the {name} of a record that was read is not finite")
     if record.time.size < 16 or not (np.diff(record.time) > 0).all():
-        yield Finding(FALSE_PASS, "the time of a record that was read stands still or is short")
+        yield Finding(
+            FALSE_PASS, "the time of a record that was read does not increase or is short"
+        )
     if record.displacement is None or np.isfinite(record.displacement).sum() < 16:
         yield Finding(FALSE_PASS, "a record that was read has too few displacements")
 
@@ -278,7 +280,7 @@ def _read_path(data: bytes, folder: Path) -> Iterator[Finding]:
     if not (np.isfinite(target.time).all() and np.isfinite(target.displacement).all()):
         yield Finding(FALSE_PASS, "a path that was read is not finite")
     elif target.time.size < 10 or not (np.diff(target.time) > 0.0).all():
-        yield Finding(FALSE_PASS, "the time of a path that was read stands still or is short")
+        yield Finding(FALSE_PASS, "the time of a path that was read does not increase or is short")
     elif not (0.0 < target.span < np.inf):
         yield Finding(FALSE_PASS, "a path that was read has no finite span")
 

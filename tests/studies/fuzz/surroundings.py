@@ -21,15 +21,15 @@ from tests.studies.fuzz.commands import (
     WORKS,
     Around,
     environment,
-    given_files,
     half_written,
+    input_files,
     left_files,
     misbehaved,
     place,
     psa,
 )
 
-#: Of Linux's prctl: take a right away, such as what lets root write anywhere.
+#: Of Linux's prctl: drop a capability, such as root's to write anywhere.
 _DROP, _RIGHTS = 24, (1, 2, 3, 24)
 #: A cache in its usual place, below the folder of the user.
 _USUAL = {
@@ -40,7 +40,7 @@ _USUAL = {
 
 @dataclass(frozen=True)
 class Odd:
-    """Odd surroundings: how they are made, and words of which a failure must say one, lower case.
+    """Unusual surroundings: their set-up, and words of which a failure's message has one.
 
     Without `words` the command must work. The command runs as a user who may not do everything.
     `place` is made in the command's folder, `variable` names it, and `output` is written there;
@@ -220,7 +220,7 @@ def _surround(data: bytes, where: Path) -> Iterator[Finding]:
             around.first()
 
         target = folder / chosen.name if chosen.output else folder
-        places = {n: folder / n for n in given_files()} | {n: target / n for n in work.outputs}
+        places = {n: folder / n for n in input_files()} | {n: target / n for n in work.outputs}
         named = [places.get(a, a) for a in work.arguments]  # whole paths: the folder may be gone
         what = f"{case['surroundings']}: psa {case['run']}"
         ended = psa(named, folder, replace(around, first=first))
@@ -250,7 +250,7 @@ def _many(data: bytes, where: Path) -> Iterator[Finding]:
         for process in running:
             _, err = process.communicate()
             if process.returncode:
-                yield Finding(WRONG_EXIT, f"{what}: one says {err.decode()[-200:]}")
+                yield Finding(WRONG_EXIT, f"{what}: the error of one is {err.decode()[-200:]}")
         if (n := len({(folder / f"{k}.csv").read_bytes() for k in range(count)})) != 1:
             yield Finding(WRONG_EXIT, f"{what} give {n} results")
         if left := [p.name for p in (folder / "cache" / "models").iterdir() if p.is_dir()]:
@@ -259,7 +259,7 @@ def _many(data: bytes, where: Path) -> Iterator[Finding]:
 
 TARGETS = (
     Target("environments", "environments", ".json", _surroundings_case, _surround, 5.0,
-           2 * LIMIT_S, None, given_files),
+           2 * LIMIT_S, None, input_files),
     Target("many-at-once", "environments", ".json", lambda _: b'{"commands": 20}', _many, 1.0,
-           2 * LIMIT_S, None, given_files),
+           2 * LIMIT_S, None, input_files),
 )  # fmt: skip

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 all as kept, or accepted; 1 answers changed."""
     parser = argparse.ArgumentParser(prog="python -m tests.studies.golden", description=__doc__)
     parser.add_argument("--accept", action="store_true", help="keep the answers")
-    parser.add_argument("--only", default="", help="pattern of kind/name, as exam/k1 or ^own/")
+    parser.add_argument("--only", default="", help="pattern of kind/name, as exam/k1 or ^measured/")
     parser.add_argument("--twelfth", action="store_true", help="the quick ones, one of twelve")
     parser.add_argument("--history", action="store_true", help="processor times, by commit")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes")

@@ -41,7 +41,7 @@ class Case:
 
 
 def answered(*arguments: Any, **words: Any) -> tuple[dict[str, Any], Answer, float]:
-    """Return a diagnosis as it is written, what it names, and its processor time [s]."""
+    """Return the JSON of a diagnosis, its answer, and its processor time [s]."""
     begin = time.process_time()
     table = psa.diagnose(*arguments, **words).to_dict()
     seconds = time.process_time() - begin
@@ -205,7 +205,7 @@ def _asks() -> Iterator[tuple[str, str, str, Ask]]:
 ASKS = {f"{kind}/{name}": ask for kind, name, _, ask in _asks()}
 
 
-def _asked(ask: Ask, folder: Path) -> Row:
+def _examined(ask: Ask, folder: Path) -> Row:
     return diagnosed(*ask(folder, 0))
 
 
@@ -220,7 +220,7 @@ def _measured(fitted: list[int], held_out: list[int], folder: Path) -> Row:
 
 _MEASURED = {"sine": ([0], []), "loops": ([1], []), "both": ([0, 1], []), "on-sine": ([1], [0])}
 _MEMORIES = ["hysteresis", "stop", "curve", "zero", "drift"]
-_OWN: dict[str, tuple[str, Callable[[], psa.Model], Callable[[], Any], dict[str, Any]]] = {
+_USER_MODELS: dict[str, tuple[str, Callable[[], psa.Model], Callable[[], Any], dict[str, Any]]] = {
     "bouc-wen": ("hysteresis_of_x_in_v", models.oscillator, lambda: plants.bouc_wen(1), {}),
     "bouc-wen-noisy": (
         "hysteresis_of_x_in_v", models.oscillator, lambda: plants.bouc_wen(2, noise=3e-5), {},
@@ -245,8 +245,8 @@ _OWN: dict[str, tuple[str, Callable[[], psa.Model], Callable[[], Any], dict[str,
 }  # fmt: skip
 
 
-def _own(name: str, folder: Path) -> Row:
-    hidden, model, made, words = _OWN[name]
+def _user_model(name: str, folder: Path) -> Row:
+    hidden, model, made, words = _USER_MODELS[name]
     records = made()
     if isinstance(records, list):
         *records, last = records
@@ -259,7 +259,7 @@ def _own(name: str, folder: Path) -> Row:
 
 def _identified(folder: Path) -> Row:
     """Return which parameters of a sound stack `psa identify` determines, with intervals."""
-    record, file = folder / "record.csv", folder / "found.json"
+    record, file = folder / "record.csv", folder / "identification.json"
     make_record(None, 990101, record, excitation="loops", visible=None)
     done("identify", record, "--json", file, "--quiet")
     content = json.loads(file.read_text("utf-8"))
@@ -276,11 +276,11 @@ def _identified(folder: Path) -> Row:
 
 def _all() -> Iterator[Case]:
     for kind, name, hidden, ask in _asks():
-        yield Case(kind, name, hidden, partial(_asked, ask))
+        yield Case(kind, name, hidden, partial(_examined, ask))
     for name, (fitted, held) in _MEASURED.items():
         yield Case("measured", name, "-", partial(_measured, fitted, held))
-    for name, (hidden, *_) in _OWN.items():
-        yield Case("own", name, hidden or "-", partial(_own, name))
+    for name, (hidden, *_) in _USER_MODELS.items():
+        yield Case("own", name, hidden or "-", partial(_user_model, name))
     yield Case("identify", "loops", "-", _identified)
     for name, work in EXPORTS.items():
         yield Case("export", name, "-", work)

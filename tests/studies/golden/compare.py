@@ -60,7 +60,7 @@ def _git(*arguments: str) -> str:
 
 
 def keep(rows: Mapping[str, Row]) -> None:
-    """Write answers, those that are not in `rows` as they were; cases that are gone go."""
+    """Write answers; those not in `rows` stay, those without a case are removed."""
     every = {**kept(), **rows}
     ANSWERS.mkdir(exist_ok=True)
     for kind in dict.fromkeys(case.kind for case in CASES.values()):
@@ -159,7 +159,7 @@ def _error_ratio(rows: Iterable[Row]) -> float:
 
 
 def twelfth(ids: Iterable[str], before: Mapping[str, Row]) -> list[str]:
-    """Return of every twelve cases of a kind, in their order, the one that took the least time."""
+    """Return the fastest of every twelve cases of a kind, in their order."""
     kinds: dict[str, list[str]] = {}
     for case in ids:
         kinds.setdefault(case.split("/")[0], []).append(case)

@@ -94,7 +94,7 @@ def _limited(run: Run, gain: float) -> tuple[DrivePath, FloatArray, FloatArray]:
 
 
 def _behind_limit(run: Run, _: Parameters, gain: float) -> Run:
-    """The stack behind the limit; its command is what would drive it so without one."""
+    """The stack behind the limit; its command gives the same voltage without a limit."""
     path, force, fine = _limited(run, gain)
     edge = run.stack.drive_time / gain
     command = path.voltage + np.clip(run.fine_command - path.voltage, -edge, edge)

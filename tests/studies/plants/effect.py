@@ -94,7 +94,7 @@ class HiddenEffect:
 def hidden(
     gain: str, unit: str, plausible: tuple[float, float], **more: Any
 ) -> Callable[[Contribution], HiddenEffect]:
-    """Make an effect of what it adds: a function of the effect's name."""
+    """Make an effect from the function of its contribution, which has the effect's name."""
     return lambda adds: HiddenEffect(adds.__name__, gain, unit, plausible, adds, **more)
 
 

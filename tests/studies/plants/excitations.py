@@ -130,7 +130,7 @@ STAIRCASE_SAMPLES = 12_000
 Wave = tuple[float, FloatArray]
 """Sampling rate [Hz] and voltage over the span (N,)."""
 Shape = Callable[[np.random.Generator, int], FloatArray]
-"""A voltage over the span with so many samples."""
+"""A voltage over the span with a number of samples."""
 
 
 def _blocks(

@@ -15,9 +15,8 @@ _EFFECTS = (
     ceramic.dead_zone_hysteresis, mechanics.cross_axis, sensor.range_switch, sensor.source_power,
 )  # fmt: skip
 HIDDEN_EFFECTS: dict[str, HiddenEffect] = {effect.name: effect for effect in _EFFECTS}
-"""In the project's table, then the foreign ones. Reciprocal coupling has a plant of its own
-(`mechanics.two_masses`) but is left out: it moves resonances of 1-20 kHz, which no record
-here sees.
+"""Effects of the project's table, then the foreign ones. Reciprocal coupling is left out: its
+plant (`mechanics.two_masses`) moves resonances of 1-20 kHz, which no record here contains.
 """
 
 KNOWN = tuple(name for name, effect in HIDDEN_EFFECTS.items() if not effect.foreign)

@@ -25,7 +25,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_
 def answer_all(
     data: Path, answers: Path, method: str, jobs: int, progress: Callable[[str], None]
 ) -> None:
-    """Answer every case of a data set; a case that has an answer is left as it is."""
+    """Answer every case of a data set; a case that has an answer is skipped."""
     names = sorted(p.name for p in (data / "cases").iterdir())
     todo = [(answers, data, n) for n in names if not (answers / f"{n}.json").exists()]
     on_all_cores(write_answer, [(method, *job) for job in todo], progress, workers=jobs)

@@ -35,7 +35,7 @@ from tests.studies.plants.table import FOREIGN, KNOWN, called
 SHARES = {"known": 0.5, "clean": 0.2, "foreign": 0.1, "weak": 0.1, "two": 0.1}
 #: The base model absorbs a lag of the sensor: no gain makes it visible.
 VISIBLE = tuple(name for name in KNOWN if name != "sensor_lag")
-#: Drawn relative to their record (`in_terms_of`), which knows the first effect only.
+#: Drawn relative to their record (`in_terms_of`), which has the first effect only.
 _FIRST_ONLY = ("offset_drift", "self_heating", "voltage_saturation")
 #: Draws of one effect before the next one takes its place.
 _ATTEMPTS = 3
@@ -177,7 +177,7 @@ LETTERS = {
     "f_out": "force behind the lag [N]",
     "f_load": "external force, 0 in all records [N]",
     "y, x": "displacement of the wafers, of the end [m]",
-    "x_m": "displacement as the sensor says it, the column `displacement` [m]",
+    "x_m": "displacement that the sensor reads, the column `displacement` [m]",
     "'": "derivative by time",
 }
 
@@ -191,8 +191,8 @@ def base_content(model: psa.Model) -> dict[str, Any]:
         ],
         "letters": LETTERS,
         "parameters": [_parameter(p) for c in model.components for p in c.parameters],
-        "values": "Every case has other values, which are not told. Those here are an example's.",
-        "start": "Every record begins at rest: all states are 0.",
+        "values": "Every case has other values, not published. Those here are an example.",
+        "start": "Every record starts at rest: all states are 0.",
     }
 
 
