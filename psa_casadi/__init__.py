@@ -5,7 +5,7 @@ The public names, in the order of the workflow:
     import psa_casadi as psa
 
     record = psa.read_record("record.csv")
-    found = psa.identify([record])                  # parameters with intervals
+    fitted = psa.identify([record])                 # parameters with intervals
     result = psa.diagnose([record])                 # what is missing, the cause, the gain
     psa.write_report(result, "report.html")
     psa.save_model(result.model, "extended.json")
@@ -13,7 +13,7 @@ The public names, in the order of the workflow:
     psa.check_fmu("extended.fmu", result.model).passed
     psa.export_modelica(result.model, "PiezoStack.mo")
 
-`psa.design` holds designed experiments, inputs and mechanisms, `psa.system` what stands around a
+`psa.design` holds designed experiments, inputs and mechanisms, `psa.system` what surrounds a
 stack, `psa.online` observers and feed-forward for use in a loop. `__init__.pyi` lists all names and
 their modules. Each name is loaded when it is first used, so that importing the package is quick.
 """

@@ -29,7 +29,7 @@ def _with_help_of(work: Callable[..., Any]) -> Callable[[Callable[..., Any]], Ca
     """Add to a function's help that of the function for any other model."""
 
     def documented(face: Callable[..., Any]) -> Callable[..., Any]:
-        words = f"Of a model of your own, {face.__name__}{signature(work)}:\n\n    {work.__doc__}"
+        words = f"For your model, {face.__name__}{signature(work)}:\n\n    {work.__doc__}"
         face.__doc__ = f"{face.__doc__}\n    {words}"
         return face
 

@@ -16,7 +16,7 @@ def main() -> None:
 
         run()
     except KeyboardInterrupt:
-        sys.stderr.write("Interrupted: nothing was begun.\n")
+        sys.stderr.write("Interrupted: nothing was started.\n")
     except SystemExit as ended:
         if ended.code != INTERRUPTED:
             raise

@@ -45,7 +45,7 @@ def batch(
         workers: Devices at a time; by default one for each core.
         dask: Address of a Dask scheduler that hands the devices out, such as tcp://HOST:8786, or
             local for a cluster on this machine (extra dask).
-        model: MODEL.json whose values every fit starts from, or a model of your own.
+        model: MODEL.json whose values every fit starts from, or your model.
 
     Example:
         psa batch records -o results --report population.html

@@ -35,8 +35,8 @@ def check(
     It is compared with the model that --model or --stack names, else with the one that it carries.
     One that another tool made is checked by the standard: a row fails where a clause is violated.
 
-    This RUNS THE CODE of the FMU, as every simulation with it does. A process
-    of its own, with limits of time and memory, keeps its faults from the table.
+    This RUNS THE CODE of the FMU, as every simulation with it does. A separate
+    process, with limits of time and memory, keeps its faults from the table.
     It is no sandbox: the code can read and write your files and use the
     network. Check an FMU that you do not trust in a container.
 

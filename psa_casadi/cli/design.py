@@ -50,11 +50,11 @@ def experiment(
 ) -> None:
     """Design the record to measure next: best for parameters, or to separate effects.
 
-    With --separate the rivals are fitted to the records given, else they have ordinary sizes.
+    With --separate the rivals are fitted to the supplied records, else they have ordinary sizes.
 
     Options:
         more: Further effects to separate.
-        model: MODEL.json, or a model of your own, whose inputs --input names.
+        model: MODEL.json, or your model, whose inputs --input names.
         record: Record already measured (repeat for several); the rivals are fitted to it, and the
             design has a stack's voltages and length of it.
         separate: Effect to separate from the others that are named.
@@ -62,7 +62,7 @@ def experiment(
             where none is named.
         optimality: Volume, worst direction or mean square of the intervals.
         family: Family of inputs.
-        input_: Input of a model of your own that may move, NAME=LOW:HIGH, with its largest rate
+        input_: Input of your model that may move, NAME=LOW:HIGH, with its largest rate
             NAME=LOW:HIGH:RATE, in SI units; repeat for several.
         low: Lowest voltage [V].
         high: Highest voltage [V].
@@ -71,7 +71,7 @@ def experiment(
         rate: Largest rate [V/s].
         current: Largest current [A].
         bandwidth: Bandwidth [Hz].
-        noise: Noise of the sensor, rms [nm]; of a model of your own NAME=RMS for each output, in
+        noise: Noise of the sensor, rms [nm]; for your model NAME=RMS for each output, in
             its unit. By default 0.1 % of what the output moves.
         correlation: Correlation of the noise in neighbouring samples.
         starts: Inputs that are improved, at most.
@@ -108,7 +108,7 @@ def experiment(
     if len(effects) == 1:
         inputs.add("One effect alone cannot be separated from anything; name two effects or more.")
     if effects and parameter:
-        inputs.add("--separate and --parameter are both given; design one record for each.")
+        inputs.add("--separate and --parameter exclude each other; design one record for each.")
     if not 0.0 <= correlation < 1.0:
         inputs.add(f"--correlation is {correlation:g}; give a number from 0 to below 1.")
     if starts < 1:
@@ -160,7 +160,7 @@ def _limits(
     if is_stack(model) and records:
         return {"voltage": limits_of(records, **wanted)}
     if "duration" not in given_limits:
-        raise InputError("No length is given; add --duration SECONDS, or --record with records.")
+        raise InputError("The length is missing; add --duration SECONDS, or --record with records.")
     samples = int(given_limits.pop("samples", _SAMPLES))
     if is_stack(model):
         given_limits = {"low": 0.0, "high": model.values.get("u_rated", 0.0), **given_limits}

@@ -55,11 +55,11 @@ def diagnose(
     """Find what the base model gets wrong, name the cause, extend the model, measure the gain.
 
     The exit code is 0 for every verdict; with --expect or --max-error it is 1 where the result is
-    not as they say. Of a model of your own, --model FILE.py:FUNCTION or an FMU, it searches the
+    not as specified. For your model, --model FILE.py:FUNCTION or an FMU, it searches the
     effects at its inputs, rates and outputs.
 
     Options:
-        model: MODEL.json whose values the fits start from, or a model of your own.
+        model: MODEL.json whose values the fits start from, or your model.
         holdout: Record kept for judging only (repeat the option for several); without it, a quarter
             of every record, in blocks.
         reference: Record of the same device when it was healthy (repeat the option for several):
@@ -73,7 +73,7 @@ def diagnose(
             by default next to the JSON file or the page.
         timings: Print what each stage took: time, processor time, simulations.
         leave_out: Effect that is not to be looked for, as one that cannot be there; repeat the
-            option for several. Of a model of your own, how the names of such effects begin.
+            option for several. For your model, the first letters of such effects' names.
         events: File that gets a line of JSON for every fit of the search while it runs: its causes,
             evidence, score and errors.
         expect: Verdicts of which one must come out, with commas between, else exit code 1:
@@ -213,7 +213,7 @@ def _keep_apart(inputs: Inputs, output: Path | None, model: Path | None) -> None
     if output is None or model is None or model.resolve().parent != output.resolve().parent:
         return
     if fnmatch(model.name, f"{output.stem}_*_for_*.json"):
-        inputs.add(f"{model}: a model beside {output} could overwrite it; give -o another name.")
+        inputs.add(f"{model}: a model next to {output} could overwrite it; give -o another name.")
 
 
 def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, ...]":

@@ -35,7 +35,7 @@ def noted(d: result.Diagnosis, left_out: Sequence[str]) -> result.Diagnosis:
     if not left_out:
         return d
     names = ", ".join(dict.fromkeys(left_out))
-    return replace(d, remarks=(*d.remarks, f"Not looked for, as --leave-out says: {names}."))
+    return replace(d, remarks=(*d.remarks, f"Not looked for, because of --leave-out: {names}."))
 
 
 def models(d: result.Diagnosis, output: Path | None) -> list[str]:
@@ -48,13 +48,13 @@ def models(d: result.Diagnosis, output: Path | None) -> list[str]:
 
 
 def unfinished(stop: result.DiagnosisInterrupted, files: Outputs) -> KeyboardInterrupt:
-    """Write the best model so far; return the interrupt that says so."""
+    """Write the best model so far; return the interrupt that reports it."""
     files.write("--output", lambda path: psa.save_model(stop.model, path))
     return files.cut_off(f"there is no verdict; {stop}", " (marked as interrupted)")
 
 
 def finished(d: result.Diagnosis, files: Outputs) -> KeyboardInterrupt:
-    """Write what takes no time of a finished diagnosis; return the interrupt that says so."""
+    """Write what takes no time of a finished diagnosis; return the interrupt that reports it."""
     write_models(d, files)
     return files.cut_off("the diagnosis was finished before")
 

@@ -43,7 +43,7 @@ def c(
         output: Folder of the two files.
         step: Time of a step with its unit, such as 10us.
         model: MODEL.json to export.
-        part: Part to export, tuned to the stack of --stack or --model where one is given:
+        part: Part to export, tuned to the stack of --stack or --model if specified:
             position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,
             adaptive_feed_forward, online_identification. Others have their default values:
             flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism.
@@ -130,7 +130,7 @@ def fmu(
         solver: adaptive: to a tolerance; fixed: steps of constant cost.
         step: Time of a fixed step with its unit, such as 10us.
         name: Model identifier, a C name; by default the model's name.
-        parameter_sets: Random parameter sets within the uncertainty to put inside, beside their
+        parameter_sets: Random parameter sets within the uncertainty to put inside, besides their
             mean and sigma points; 0 leaves all of them out.
         sets_to: Folder to write the parameter sets to as well.
         validity_output: Add the output outside_validity: how far a run has left what the records
@@ -264,7 +264,7 @@ def ssp(
     """Write a nanopositioner as SSP: controller, compensator, amplifier, stack, flexure, wired.
 
     The file of an FMU's model, as `psa diagnose --fmu` writes it, becomes that FMU between FMUs of
-    the effects that were found at its inputs and outputs.
+    the effects that were identified at its inputs and outputs.
 
     Options:
         output: SSP archive to write.

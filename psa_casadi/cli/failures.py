@@ -41,7 +41,7 @@ _SHOW_CURSOR = "\x1b[?25h"
 def interrupts() -> Iterator[None]:
     """Let Ctrl-C end what runs inside, compiled code and other threads too; also a decorator.
 
-    Python's own handler waits until the main thread is back from C. Here a thread that the signal
+    Python's handler waits until the main thread is back from C. Here a thread that the signal
     wakes at once sets the flag of the work (`psa_casadi.common.interruption`). Outside the main
     thread of a process nothing changes.
     """
@@ -53,7 +53,7 @@ def interrupts() -> Iterator[None]:
         theirs.setblocking(False)
 
         def interrupt(number: int, frame: FrameType | None) -> None:
-            work.stop()  # a solver that takes the exception for its own failure ends all the same
+            work.stop()  # a solver that takes the exception for its failure ends all the same
             raise KeyboardInterrupt
 
         handler = signal.signal(signal.SIGINT, interrupt)
@@ -244,7 +244,7 @@ def _error_lines(error: Exception) -> list[str]:
             return [f"Error: {error.problems[0]}"]
         count = sum(not p.startswith("... and") for p in error.problems)
         each = (f"  - {problem}" for problem in error.problems)
-        return [f"Error: {count} problems with what was given:", *each]
+        return [f"Error: {count} problems with the input:", *each]
     if isinstance(error, (PsaError, MachineError)):
         return [f"Failed: {error}"]
     fault = (

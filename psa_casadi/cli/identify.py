@@ -36,14 +36,14 @@ def identify(
 ) -> None:
     """Fit the model of a stack to records; show which parameters the data determine.
 
-    Of a model of your own, --model FILE.py:FUNCTION or an FMU, it fits the parameters that are
-    free; columns are found by the names of its inputs and outputs.
+    For your model, --model FILE.py:FUNCTION or an FMU, it fits the parameters that are
+    free; columns are matched by the names of its inputs and outputs.
 
     Options:
-        model: MODEL.json whose values the fits start from, or a model of your own.
+        model: MODEL.json whose values the fits start from, or your model.
         output: MODEL.json to write; of an FMU also NAME.fmu, the FMU with these start values, or
             NAME.ssv, a parameter set of SSP.
-        method: How the parameters are found.
+        method: How the parameters are fitted.
         profile: Parameter whose profile likelihood is wanted; may be repeated.
         json: JSON file of parameters and records to write.
         report: HTML page of the fit to write.

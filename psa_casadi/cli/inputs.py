@@ -131,7 +131,7 @@ class Inputs:
     def refuse(self, others: Mapping[str, object]) -> None:
         """Refuse the options with a value, which a model that is no stack does not take."""
         for option in [name for name, value in others.items() if value]:
-            self.add(f"{option} is not there for a model of your own; leave it out.")
+            self.add(f"{option} does not apply to your model; leave it out.")
 
     def numbers(self, option: str, texts: Sequence[str] | None) -> dict[str, float]:
         """Return the numbers of an option NAME=VALUE that may be repeated."""
@@ -141,7 +141,7 @@ class Inputs:
     def named(
         self, option: str, texts: Sequence[str] | None, form: str, counts: Container[int] = (1,)
     ) -> dict[str, tuple[float, ...]]:
-        """Return the numbers of an option NAME=NUMBER:NUMBER: so many as the `counts` allow."""
+        """Return the numbers of an option NAME=NUMBER:NUMBER, of which `counts` are allowed."""
         values: dict[str, tuple[float, ...]] = {}
         for text in texts or ():
             name, _, figures = text.partition("=")
@@ -179,7 +179,7 @@ class Inputs:
         if not is_stack(model):
             self.add(
                 f"{path}: this model has no voltage input or no displacement of a stack, so it is"
-                " no stack; give a stack's file. A model of your own is for `psa identify`,"
+                " no stack; give a stack's file. Other models are for `psa identify`,"
                 " `diagnose`, `batch`, `simulate`, `export`, `check` and `compare`."
             )
             return None
@@ -201,8 +201,8 @@ class Inputs:
         options = {"--model": path, "--stack": stack, "--part": part}
         named = [name for name, value in options.items() if value is not None]
         if len(named) > 1:
-            all_of_them = "both" if len(named) == 2 else "all"
-            self.add(f"{' and '.join(named)} are {all_of_them} given; leave one of them out.")
+            but_one = "one" if len(named) == 2 else "all but one"
+            self.add(f"{' and '.join(named)} exclude each other; leave {but_one} out.")
             return None
         if part is not None:
             return self.attempt(lambda: psa.part_model(part))
@@ -211,7 +211,7 @@ class Inputs:
         if path is None:
             if needed:
                 self.add(
-                    "No model is given; add --model MODEL.json, or --stack NAME (`psa stacks`)."
+                    "The model is missing; add --model MODEL.json, or --stack NAME (`psa stacks`)."
                 )
             return None
         if any_model:
@@ -280,7 +280,7 @@ class Inputs:
                 self.add(f"{path}: {option} writes {what}, {' or '.join(known)}; name it so.")
             if where in taken:
                 self.add(
-                    f"{path}: both {taken[where]} and {option} name it; give each its own file."
+                    f"{path}: both {taken[where]} and {option} name it; give each a separate file."
                 )
             elif where in sources:
                 self.add(f"{path}: {option} would overwrite an input; give another name.")
@@ -338,16 +338,16 @@ class Fitting:
 
     Options:
         fmu: FMU of any tool, in the place of --model.
-        free: Parameter of a model of your own to fit, by default all that may be; repeat the option
+        free: Parameter of your model to fit, by default all that may be; repeat the option
             for several. Of an FMU whose description has no bounds for it, with these:
             NAME=LOW:HIGH.
-        value: Value of a parameter of an FMU in the place of its own, NAME=VALUE, or of an input
+        value: Value of a parameter of an FMU that replaces its default, NAME=VALUE, or of an input
             that no record has; repeat the option for several.
-        zeros: Output of a model of your own whose zero is unknown in each record; repeat the option
+        zeros: Output of your model whose zero is unknown in each record; repeat the option
             for several.
-        hold: What the inputs of a model of your own do between samples; by default what the
+        hold: What the inputs of your model do between samples; by default what the
             records make likelier.
-        known_start: The records of a model of your own begin at its declared states.
+        known_start: The records of your model start at its declared states.
     """
 
     fmu: Path | None = None
@@ -376,18 +376,18 @@ def own_model(
     A model that cannot be made ends the command.
     """
     if fitting.fmu is not None and path is not None:
-        inputs.add("--fmu and --model are both given; leave one of them out.")
+        inputs.add("--fmu and --model exclude each other; leave one of them out.")
     model = (
         None if (place := fitting.fmu or path) is None else _model(inputs, place, fitting, fitted)
     )
     if model is None or not model.structure.foreign:
         bounds = [text for text in fitting.free or () if "=" in text]
         for text in [*bounds, *(fitting.value or ())]:
-            inputs.add(f"'{text}' is said of an FMU; add --fmu FILE.fmu.")
+            inputs.add(f"'{text}' applies to an FMU; add --fmu FILE.fmu.")
     if model is None:
         for name in fitting.words:
             option = name.replace("_", "-")
-            inputs.add(f"--{option} is said of a model of your own; add --model FILE.py:FUNCTION.")
+            inputs.add(f"--{option} applies to your model; add --model FILE.py:FUNCTION.")
     return model
 
 
@@ -428,7 +428,7 @@ def from_python(path: Path) -> psa.Model | None:
         held = runpy.run_path(str(file), run_name=file.stem)
         made = held.get(name)
         model = made() if callable(made) else made
-    except Exception as error:  # the user's own code may raise anything
+    except Exception as error:  # the user's code may raise anything
         raise InputError(
             f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
         ) from error

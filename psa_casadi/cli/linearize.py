@@ -27,10 +27,10 @@ def linearize(
 ) -> None:
     """Linearise a model at rest: A, B, C, D, poles, Bode picture, margins, Kalman filter.
 
-    A stack, a model of your own (FILE.py:FUNCTION or its file), or an FMU of model exchange.
+    A stack, your model (FILE.py:FUNCTION or its file), or an FMU of model exchange.
 
     Options:
-        model: MODEL.json, or a model of your own.
+        model: MODEL.json, or your model.
         fmu: FMU of any tool, in the place of --model.
         at: Input at the operating point, NAME=VALUE in SI units; repeat for several.
         state: State there, NAME=VALUE in SI units, where it is not at rest; repeat for several.

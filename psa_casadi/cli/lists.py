@@ -31,7 +31,7 @@ def effects(
         name: Name of one effect.
         figure: Picture of the effect's signature to write, PNG, SVG or PDF as its name ends; needs
             NAME.
-        model: MODEL.json of the stack for which NAME's size is told.
+        model: MODEL.json of the stack for which NAME's size is computed.
 
     Example:
         psa effects slow_creep --figure creep.png

@@ -21,10 +21,10 @@ Options:
     still: Page without the model that runs in it: nothing is compiled for it.
     junit: JUnit XML to write, which CI servers show as tests.
     columns: Which array of the file is which column, if the names differ:
-        time=t:ms,voltage=log.u,displacement=m.2:um. A number says what 1 in the file is:
-        displacement=CH2:10um. FILE@NAME says it of one file: b.csv@time=t:ms; table=2 takes one of
+        time=t:ms,voltage=log.u,displacement=m.2:um. A number states what 1 in the file is:
+        displacement=CH2:10um. FILE@NAME applies to one file: b.csv@time=t:ms; table=2 takes one of
         several tables in a file, table=all each as a record.
-    effects: Module that holds effects of your own, as in mypackage.effects; repeat the option for
+    effects: Module that holds your effects, as in mypackage.effects; repeat the option for
         several.
     quiet: No progress and no summary; errors still show.
 """

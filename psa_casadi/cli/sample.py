@@ -33,15 +33,15 @@ def sample(
     origin: Origin = "measured",
     inputs: Inputs,
 ) -> None:
-    """Draw the parameters of a model from their posterior, given records (extra sample).
+    """Draw the parameters of a model from their posterior for these records (extra sample).
 
-    The No-U-Turn sampler on exact gradients; priors are weak unless --prior says more.
+    The No-U-Turn sampler on exact gradients; priors are weak unless --prior sets them.
 
     Options:
-        model: MODEL.json whose values the chains start near, or a model of your own.
+        model: MODEL.json whose values the chains start near, or your model.
         output: netCDF file of the draws to write, as ArviZ has it.
         free: Parameter to sample; may be repeated. By default those that the model was fitted in,
-            of a model of your own all that may be fitted.
+            for your model all that may be fitted.
         prior: Prior of a parameter, NAME=CENTRE:WIDTH in SI units, as k_L=7.3:0.1; the width is
             that of the logarithm where a parameter spans decades, else in ordinary changes. May be
             repeated.

@@ -34,12 +34,12 @@ def simulate(
 
     The stack starts settled at the first voltage, its hysteresis and creep relaxed, or as --history
     leaves them. With --start-voltage, or a model that has start values, it starts like an FMU
-    exported with the same options. A model of your own, a file of that, FILE.py:FUNCTION or an FMU,
+    exported with the same options. Your model, its file, FILE.py:FUNCTION or an FMU,
     starts at its start values.
 
     Options:
-        input_: Record with time and voltage, and load_force if any; with the inputs of a model of
-            your own by their names.
+        input_: Record with time and voltage, and load_force if any; with the inputs of your
+            model by their names.
         output: CSV to write.
         fmu: FMU of any tool, in the place of --model.
         value: Parameter in place of the model's, NAME=VALUE in SI units; repeat for several.

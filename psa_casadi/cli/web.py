@@ -41,8 +41,8 @@ def web(
     stack's, or of --model FILE.py:FUNCTION or --fmu.
 
     Options:
-        model: MODEL.json to play with; by default every named stack. With --diagnose, a model of
-            your own.
+        model: MODEL.json to play with; by default every named stack. With --diagnose, your
+            model.
         output: HTML page to write.
         diagnose: Serve a page, to this machine only, that diagnoses records: drop files, map their
             columns, watch the search.
@@ -60,7 +60,7 @@ def web(
         any_model = own_model(inputs, model, fitting)
         if (model is not None and any_model is None) or stack is not None or output is not None:
             raise InputError(
-                "--diagnose serves a page of its own: leave --stack, -o and a stack's --model out;"
+                "--diagnose serves a separate page: leave --stack, -o and a stack's --model out;"
                 " a MODEL.json to start from is dropped there."
             )
         inputs.check()
@@ -72,7 +72,7 @@ def web(
     if port is not None or no_browser:
         inputs.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
     if fitting != Fitting():
-        inputs.add("a model of your own is for --diagnose; add that.")
+        inputs.add("your model is for --diagnose; add that.")
     inputs.outputs({"--output": path}, [model], page="--output")
     chosen = inputs.model_or_stack(model, stack, needed=False)
     inputs.check()

@@ -108,7 +108,7 @@ def _refuse(room: Path, error: OSError) -> None:
         _REFUSED.add(room)
         logging.getLogger("psa_casadi").warning(
             "The cache folder %s cannot be used (%s); what it would keep is made again each time."
-            " Free it, or set %s to a folder of your own.",
+            " Free it, or set %s to another folder.",
             room,
             error.strerror or error,
             VARIABLE,

@@ -189,7 +189,7 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
         twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-        raise ValueError(f"the name {brief(twice)} stands twice in one object")
+        raise ValueError(f"the name {brief(twice)} occurs twice in one object")
     return table
 
 

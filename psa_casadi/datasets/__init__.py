@@ -151,7 +151,7 @@ def _from_folder(folder: Path, dataset: Dataset, name: str, sha256: str, how: st
     path = folder / name
     if not path.is_file():
         raise InputError(
-            f"{path}: there is no such file, and {DATA_VARIABLE} says that records lie there; {how}"
+            f"{path}: there is no such file, but {DATA_VARIABLE} names its folder; {how}"
             f" on a machine with a network, or unset {DATA_VARIABLE}."
         )
     if _sha256(path.read_bytes()) != sha256:

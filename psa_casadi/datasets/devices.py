@@ -207,7 +207,7 @@ def _axis(axis: int, level: int, signal: int | None = None) -> DatasetFile:
     length = "one period" if signal is None else "two periods"
     return _file(
         name,
-        f"axis {axis + 1} and its own actuator, {which}, {level} mV rms, {length}",
+        f"axis {axis + 1} and its actuator, {which}, {level} mV rms, {length}",
         "steering_mirror",
         [f"{what}_{level}mV_{part}.npy" for part in parts for what in "uy"],
         OneAxis(axis, SIGNS[axis], signal or 0, len(parts), sample_rate=6400.0),

@@ -197,11 +197,13 @@ def _rest(model: Model, time: float, x: FloatArray, u: FloatArray) -> FloatArray
                 rates, x / sizes, x_scale="jac", xtol=1e-15, gtol=1e-15
             )
     except (ValueError, RuntimeError) as error:  # rates that are not finite
-        raise InputError(f"No rest of '{model.name}' is found ({error}); give `states`.") from error
+        raise InputError(
+            f"The search for a rest of '{model.name}' failed ({error}); specify `states`."
+        ) from error
     if not np.max(np.abs(solution.fun)) <= _REST:
         raise InputError(
-            f"No rest of '{model.name}' is found from its starts with these inputs; give `states`,"
-            " where it need not rest."
+            f"The search for a rest of '{model.name}' from its starts, with these inputs, failed;"
+            " specify `states`, where it need not rest."
         )
     return np.asarray(solution.x * sizes)
 
@@ -314,7 +316,7 @@ def _kalman_gain(of: Linear, w: FloatArray, c: FloatArray, v: FloatArray) -> Flo
         problem = str(error)
     if not np.isfinite(p).all() or any(np.linalg.eigvals(a - p @ reading.T @ reading).real >= 0.0):
         raise InputError(
-            f"No Kalman filter is found ({problem}); measure more outputs, or give inputs noise."
+            f"No Kalman filter results ({problem}); measure more outputs, or give inputs noise."
         )
     return np.asarray(p @ reading.T * sizes[:, None] / deviation)
 

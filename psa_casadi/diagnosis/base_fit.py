@@ -188,7 +188,7 @@ _HOPEFUL = 2.0
 _AGAIN = 1.5
 #: Sampling rate [Hz] from which a stack's resonances may show though they lie above the band; the
 #: decrease of the whitened sum of squares from which ringing is detected, and resonances at most.
-_SHOWS, SEEN, _RESONANCES = 300.0, 40.0, 2
+_SHOWS, LEAST_DECREASE, _RESONANCES = 300.0, 40.0, 2
 
 
 @stage("base fit again")
@@ -225,7 +225,7 @@ def from_band(before: Fit, progress: Progress) -> Fit | None:
     """
     result = before
     for _ in range(_RESONANCES):
-        more = _with_ringing(result, progress, SEEN)
+        more = _with_ringing(result, progress, LEAST_DECREASE)
         if more is None:
             break
         result = more
@@ -279,7 +279,7 @@ def rings(effect: Component) -> bool:
 def _tuned(fit: Fit, progress: Progress) -> Fit:
     """Return the fit with its mechanics sought again while it rings; k_P is free if determined."""
     left = ringing(fit)
-    if left is None or left.decrease >= SEEN:
+    if left is None or left.decrease >= LEAST_DECREASE:
         fit = retuned(fit, progress)
     return without_blur(fit)
 

@@ -577,14 +577,14 @@ class CauseEvidence:
 def families(
     probability: Mapping[str, float],
     places: Mapping[str, tuple[str, str]],
-    shown: CauseEvidence,
+    cause: CauseEvidence,
     corrections: Sequence[Correction],
     limits: Thresholds,
 ) -> tuple[Family, ...]:
     """Return the families that a cause may belong to, the most probable first.
 
     `probability` is that of each effect on condition that the cause is a listed one, `places` has
-    their families; `shown` is the evidence of the cause over the model without it, `corrections`
+    their families; `cause` is the evidence of the cause over the model without it, `corrections`
     are those of that model. With the evidence F_k, above the price of a cause, of each correction
     and that E of the cause, the odds that it is not listed are
 
@@ -596,7 +596,7 @@ def families(
     lacks the cause holds little information on it. One whose kind nobody has declared may be of
     any. What is missing to 1 is of no kind that was tried (`CauseEvidence.listed_probability`).
     """
-    evidence = shown.evidence
+    evidence = cause.evidence
     form = limits.further if probability else limits.form_of_unnamed
     scale = max(limits.temperature, form * evidence)
     kinds = {places[n][1] for n, p in probability.items() if n in places and p > _LEAST}
@@ -609,7 +609,7 @@ def families(
             odds = float(np.exp(min(ahead / scale, 50.0)))
             others[family] = max(others.get(family, 0.0), odds)
     odds_of_all = bool(probability) + sum(others.values())
-    listed = shown.listed_probability(limits) / odds_of_all if odds_of_all else 0.0
+    listed = cause.listed_probability(limits) / odds_of_all if odds_of_all else 0.0
     table: dict[tuple[str, str], dict[str, float]] = {family: {} for family in others}
     for name, p in probability.items():
         if name in places:

@@ -448,13 +448,13 @@ def _added(
         return float(rest @ rest)
 
     name = min(values, key=scatter)
-    seen = {n for t in result.terms for n in (*t.factors, t.over)}
+    used = {n for t in result.terms for n in (*t.factors, t.over)}
     return FreeFunction(
         port=port.words,
         evidence=scale.evidence(h) - scale.evidence(of),
         held=h.errors,
         predicted=h.predictions,
-        of=" and ".join(n for n in place.names if n in seen),
+        of=" and ".join(n for n in place.names if n in used),
         unit=port.unit,
         variable=name,
         variable_unit=place.units[name],

@@ -270,7 +270,7 @@ def _gain(port: Port, sizes: Sizes) -> Attached:
         "its gain is another one",
         "amplifier, scale of a sensor, a wrong unit",
         "Q = (1 + size) q",
-        "a residual that is the signal's share, at every level and frequency alike",
+        "a residual that is the signal's share, the same at every level and frequency",
         parameters=(
             Parameter("size", 0.0, "1", (-LARGEST, LARGEST), "change of the gain", scale=ORDINARY),
         ),
@@ -315,7 +315,7 @@ def _bend(port: Port, sizes: Sizes) -> Attached:
         "its gain depends on its level",
         "first two terms of a static curve beyond the straight line",
         "Q = q + size (cos(angle) r^2 + sin(angle) r^3),  r = q/range",
-        "harmonics that grow with the level, at every frequency alike",
+        "harmonics that grow with the level, the same at every frequency",
         parameters=(
             size_of(port.unit, size, "deviation from the line at the range's end"), ANGLE,
             scale_of("range", size, port.unit, port.variable),
@@ -512,7 +512,7 @@ def _loss(at: _Sum, v: str) -> Attached:
         f"it loses in proportion to {v}",
         "viscous damping, leak, cooling",
         f"Q loses size {v}/range",
-        "resonances are lower, and decays faster, at every level alike",
+        "resonances are lower, and decays faster, the same at every level",
         parameters=(at.size(f"loss at the largest {v}"), at.range(v)),
     )  # fmt: skip
 
@@ -529,7 +529,7 @@ def _friction(at: _Sum, v: str) -> Attached:
         "dry friction holds against the motion",
         "Coulomb's friction, smooth about rest",
         f"Q loses size {v}/sqrt({v}^2 + width^2)",
-        "what stands still needs a push to move; small motions are missed most",
+        "motion starts above a threshold only; small motions have the largest relative error",
         parameters=(
             at.size("friction, as a rate", positive=at.port.kind == "rate"),
             Parameter(
@@ -658,7 +658,7 @@ def _with(port: ports.Port, x: str, unit: str, size: float) -> Attached:
         "it drifts: ageing, heat, wear" if x == "time" else f"it depends on {x}",
         "first two terms of its series",
         f"Q = {p} (1 + size (cos(angle) r + sin(angle) r^2)),  r = {x}/range",
-        "what the parameter stands for is another one at another level or time",
+        "the parameter's value changes with the level or time",
         parameters=(
             Parameter(
                 "size", 0.0, "1", (-_MOST, _MOST), "relative change at the range's end",

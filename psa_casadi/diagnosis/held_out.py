@@ -300,8 +300,8 @@ def _powers(sums: FloatArray, counts: IndexArray) -> FloatArray:
 class Budget:
     """Where the held-out error of the base model above the noise goes.
 
-    `together` is what all causes remove, `causes` what each does given the others (the model
-    fitted again without it leaves so much more), `unnamed` what the best unnamed correction would
+    `together` is what all causes remove, `causes` what each does with the others in the model
+    (a fit without it leaves so much more), `unnamed` what the best unnamed correction would
     remove of the base's error (nothing named) or beyond the causes.
     """
 
@@ -315,8 +315,8 @@ class StackBudget(Budget):
     """The same of a stack, in lengths [m].
 
     `excess_rms_m` is the base's error above the noise `noise_rms_m`; `remains_rms_m` and
-    `remains_percent` of the range, each record's over its own as of all errors, are what the named
-    causes leave above the noise.
+    `remains_percent` of the range (each record's over that record's, as of all errors) are what the
+    named causes leave above the noise.
     """
 
     excess_rms_m: float

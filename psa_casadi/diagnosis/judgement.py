@@ -151,15 +151,17 @@ class Judge:
         """Whether the base lacks something."""
         return self.first.chosen is not None or not self.left(self.first).white
 
-    def weigh(self, before: Hypothesis, after: Hypothesis, *, beside: bool = True) -> Weighed:
+    def weigh(
+        self, before: Hypothesis, after: Hypothesis, *, with_corrections: bool = True
+    ) -> Weighed:
         """Weigh the causes that one hypothesis has more than another against corrections of that.
 
-        Without any corrections if `beside` is False. A channel counts by itself where
+        Without any corrections if `with_corrections` is False. A channel counts by itself where
         there are several, and the other's held-out rms is above `EXCESSIVE` times the noise:
 
             share_j = (P_before,j - P_after,j) / (P_before,j - s_j^2)
         """
-        result = self.corrections(before) if beside else ()
+        result = self.corrections(before) if with_corrections else ()
         removed = Removed(self.experiments, before.predictions, self.noise)
         rows = list(zip(before.fit.channels, before.errors, after.errors, self.noise, strict=False))
         each = {
@@ -178,7 +180,7 @@ class Judge:
     def weighed(self) -> Weighed:
         """All causes together, against corrections of the base."""
         both = self.first.view.of, self.last.view.of
-        return self.weigh(*both, beside=self.missing and self.driven)
+        return self.weigh(*both, with_corrections=self.missing and self.driven)
 
     @property
     def adds(self) -> bool:

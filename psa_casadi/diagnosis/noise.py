@@ -68,7 +68,7 @@ def omnibus(
     *,
     lengths: Sequence[int],
     detection_limit: float,
-    own: bool,
+    from_residual: bool,
     alarms_below: float,
 ) -> Omnibus:
     """Test a residual (samples,) [m] for structure that noise of this colour does not have.
@@ -76,19 +76,19 @@ def omnibus(
     Four tests with Bonferroni's correction: are neighbours of the whitened residual correlated;
     Fisher's g for a line in its spectrum; an F test on general features of the voltage and time;
     and is its size the same everywhere? A sensor's noise is, what a colour may have swallowed of a
-    misfit is not. With `own` the colour is the residual's: its jitter covers the size, and its
-    order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the share
-    of the residual's power above the noise `floor` [m]; structure must be larger than
+    misfit is not. With `from_residual` the colour is the residual's: its jitter covers the size,
+    and its order leaves some correlation that Schwarz's criterion does not pay for. `excess` is the
+    share of the residual's power above the noise `floor` [m]; structure must be larger than
     `detection_limit` [m] to count; `lengths` are the records' numbers of samples.
     """
     white = colour.whiten(residual)
     p, share = whiteness(white)
     tests: dict[Structure, tuple[float, float]] = {
-        "correlation": (min(1.0, _LEFT * p) if own else p, share),
+        "correlation": (min(1.0, _LEFT * p) if from_residual else p, share),
         "line": _fisher_line(white),
         "drive": _features(white, voltage, time, colour),
     }
-    if not own:
+    if not from_residual:
         tests["size"] = _sizes(white, voltage, time, lengths)
     structure, (p, share) = min(tests.items(), key=lambda item: item[1][0])
     power = float(np.mean(residual**2))

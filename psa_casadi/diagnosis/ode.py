@@ -332,7 +332,7 @@ def _table(
         if not any(n.startswith(name) for n in names):
             near = get_close_matches(name, names, 3, 0.3) or names
             raise InputError(
-                f"`leave_out` has '{name}', which begins the name of no effect; of the"
+                f"`leave_out` has '{name}', with which no effect's name starts; of the"
                 f" {len(names)} there are, the nearest are {', '.join(near)}."
             )
     return {e.name: e for e in every if not e.name.startswith((*leave_out, *known))}

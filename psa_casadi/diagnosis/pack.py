@@ -31,9 +31,9 @@ class Pack:
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], colour: Colour, limits: Thresholds,
-        *, own: bool,
+        *, from_residual: bool,
     ) -> Omnibus:  # fmt: skip
-        """Test the residual of every output along every input; the most telling one counts.
+        """Test the residual of every output along every input; the most significant one counts.
 
         With Bonferroni's correction for their number.
         """
@@ -48,7 +48,7 @@ class Pack:
             for along in moving or [np.zeros(len(left))]:
                 result = omnibus(
                     left, along, np.concatenate(time), noise, noise_rms(f.residuals, noise),
-                    lengths=f.lengths, detection_limit=f.straight, own=own,
+                    lengths=f.lengths, detection_limit=f.straight, from_residual=from_residual,
                     alarms_below=limits.alarm,
                 )  # fmt: skip
                 rows.append(replace(result, output=f.column if fit.further else ""))
@@ -78,7 +78,7 @@ class StackPack(Pack):
 
     def tested(
         self, fit: Fit, residuals: Sequence[FloatArray], colour: Colour, limits: Thresholds,
-        *, own: bool,
+        *, from_residual: bool,
     ) -> Omnibus:  # fmt: skip
         """Test the displacement's residual, or that of a column where only this one alarms."""
 
@@ -92,8 +92,8 @@ class StackPack(Pack):
             noise = noise_rms(residual, of)
             return omnibus(
                 residual, voltage, time, of, noise,
-                lengths=[int(e.used.sum()) for e in parts], detection_limit=least, own=own,
-                alarms_below=limits.alarm,
+                lengths=[int(e.used.sum()) for e in parts], detection_limit=least,
+                from_residual=from_residual, alarms_below=limits.alarm,
             )  # fmt: skip
 
         experiments, (first, *others) = fit.experiments, residuals

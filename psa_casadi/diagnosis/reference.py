@@ -208,7 +208,7 @@ class Healthy:
                 raise InputError(
                     f"{r.name}: the voltage is as in the reference, in value, rate and last"
                     f" reversals, for {np.mean(share):.0%} of the samples; what has changed"
-                    " cannot be told from the rest. Record the device with the voltage of the"
+                    " cannot be separated from the rest. Record the device with the voltage of the"
                     " reference."
                 )
         return Since(self, tuple(records), tuple(added), covered, places)

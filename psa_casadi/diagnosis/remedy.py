@@ -227,18 +227,18 @@ def _view(axis: misfit.Axis, d: FloatArray) -> tuple[misfit.View, FloatArray, Fl
     there = np.isfinite(d)
     noise = _NOISE * float(np.nanstd(d))
     residual = d + noise * np.random.default_rng(0).standard_normal(d.size)
-    seen = misfit.view(misfit.ground_of(residual, noise), axis)
+    view = misfit.view(misfit.ground_of(residual, noise), axis)
     sign = np.ones(d.size) if axis.sign is None else axis.sign
     on = there & np.isfinite(axis.x) & (sign != 0)
     coordinate, counted = np.where(on, axis.x, np.nan), np.where(on, d * sign, np.nan)
-    if not seen.x.size:
-        return seen, coordinate, counted
-    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], seen.x))
-    left = counted[on] - np.interp(x, bins, seen.mean)
+    if not view.x.size:
+        return view, coordinate, counted
+    x, bins = (np.log10(v) if axis.log else v for v in (coordinate[on], view.x))
+    left = counted[on] - np.interp(x, bins, view.mean)
     power = float(np.sum(d[there] ** 2))
     others = float(np.sum(d[there & ~on] ** 2))
     share = 1.0 - (float(np.sum(left**2)) + others) / power if power > 0 else 0.0
-    return replace(seen, share=max(0.0, share)), coordinate, counted
+    return replace(view, share=max(0.0, share)), coordinate, counted
 
 
 def _since_it_began(since: FloatArray, d: FloatArray) -> FloatArray:
@@ -451,10 +451,10 @@ SIGNED = ("hold", "top")
 class Size:
     """What an effect changes in a test, in `unit`; signed where it moves on (hold, top).
 
-    `interval` (95 %) is what the uncertainty of the effect's own parameters leaves, None where that
-    is not known. `at` says where in the test: time after the step, rate, frequency, duration. The
-    test plays between the `voltages`, of a model of one's own as its records do (None), and of that
-    one `output` shows it. `beyond_records` says that the records do not reach there.
+    `interval` (95 %) is what the uncertainty of the effect's parameters leaves, None where that
+    is not known. `at` is the point in the test: time after the step, rate, frequency, duration. The
+    test plays between the `voltages`, for a user's model as its records do (None), and of that
+    one `output` shows it. `beyond_records` means that the records do not reach there.
     """
 
     test: str

@@ -35,10 +35,10 @@ NOISE = note("noise_only")
 class Cause:
     """A named cause: where it sits, how sure, how large, and what else it may be.
 
-    `explained_share` is what it removes of the held-out error above the noise, given the others.
-    `remedy` says as a code what to do about it, `sizes` what it changes in the tests that the
-    effect declares. Of any model, `port` is where it adds to the equations. `families` are the
-    places and kinds that it may be of, the most probable first; `confidence` counts what is not
+    `explained_share` is what it removes of the held-out error above the noise, with the others in
+    the model. `remedy` is the code of what to do about it, `sizes` what it changes in the tests
+    that the effect declares. Of any model, `port` is where it adds to the equations. `families` are
+    the places and kinds that it may be of, the most probable first; `confidence` counts what is not
     listed.
     """
 
@@ -75,7 +75,7 @@ class Candidate:
 
     `evidence` is ln of the Bayes factor, held-out blocks included; estimated from the screening of
     fitted samples where nothing was `fitted`, and of effects that bend the same curve that of the
-    best one; `probability` that of being the cause, given that one effect of the table is.
+    best one; `probability` that of being the cause, on condition that one effect of the table is.
     """
 
     effect: str
@@ -200,9 +200,9 @@ class Diagnosis(Reported):
     `base_fit` and `extended_fit` are equal where nothing was added. `base` and `extended` (n, ny)
     are the predictions of every record in full, in the order of `experiments`. `candidates` are all
     effects tried, `errors` those of every measured output. `base_remaining` is what the base
-    leaves, `remaining` what the extended model does. `budget` states where the base's held-out error goes,
-    `patch` is the unnamed correction that would remove most of what the named causes leave,
-    `families` are the places and kinds that this may be of.
+    leaves, `remaining` what the extended model does. `budget` states where the base's held-out
+    error goes, `patch` is the unnamed correction that would remove most of what the named causes
+    leave, `families` are the places and kinds that this may be of.
     `doubted` states why held-out samples cannot confirm a cause, None where they can; `remarks` are
     all other notes. `noise_kinds` are those in what the extended model leaves of every output.
     """

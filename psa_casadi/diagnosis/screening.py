@@ -213,15 +213,17 @@ def copies(
     power = float(target @ target)
     result: dict[str, Copy] = {}
     for name in dict.fromkeys(d.effect.name for d in trials):
-        own = [d for d in trials if d.effect.name == name]
-        columns = np.column_stack([d.columns[0] for d in own])
+        matching = [d for d in trials if d.effect.name == name]
+        columns = np.column_stack([d.columns[0] for d in matching])
         free = without(colour.whiten(columns), basis)
         unit, sizes = _unit_vectors(free, columns, _LEFT)
         if power <= 0 or not sizes.any():
             continue
         share = float(np.sum((independent(free[:, sizes > 0.0]).T @ target) ** 2)) / power
         along = unit.T @ target / colour.level
-        ways = [_copy(own, p, unit, sizes / colour.level, along, limits) for p in spans(own)]
+        ways = [
+            _copy(matching, p, unit, sizes / colour.level, along, limits) for p in spans(matching)
+        ]
         _, direction, gain = max(ways, key=lambda w: w[0])
         result[name] = Copy(share, direction, gain)
     return power / colour.level**2, result

@@ -49,7 +49,7 @@ CHECK_FORMAT: Literal["psa_casadi.check/1"] = "psa_casadi.check/1"
 
 @dataclass(frozen=True)
 class CheckedRow:
-    """One check: the figure found (null: the check broke down), the largest allowed, a remark.
+    """One check: the computed figure (null: the check broke down), the largest allowed, a remark.
 
     Of a foreign FMU also the clause of the standard, and whether the remark is to be noted.
     """
@@ -65,7 +65,7 @@ class CheckedRow:
 
 @dataclass(frozen=True)
 class CheckFile:
-    """The checks of an FMU; `compared` says whether there was a model to compare with.
+    """The checks of an FMU; `compared` is true if there was a model to compare with.
 
     `left_out` names the checks that this kind of FMU has nothing for.
     """
@@ -105,7 +105,7 @@ class RecordUsed:
 class DeviceFile:
     """A device of a batch run: how its work ended, and the hash of files and options it is for.
 
-    `refused` says that the records cannot be used, `failed` that something else went wrong; it is
+    `refused` means that the records cannot be used, `failed` that something else went wrong; it is
     tried again by the next run. `sha256` are those of `files`, as they were written.
     """
 
@@ -211,7 +211,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """An effect of practical size that the records could not have shown."""
+    """An effect of practical size that the records could not have revealed."""
 
     effect: str
     smallest_detectable_gain: float
@@ -311,7 +311,7 @@ class AnyDiagnosisFile(ResultFile):
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class OwnModelFile(AnyDiagnosisFile):
-    """A diagnosis of a model of one's own: with the errors of every output."""
+    """A diagnosis of a user's model: with the errors of every output."""
 
     format: Literal["psa_casadi.own_model_diagnosis/1"]
     errors: tuple[OutputError, ...]
@@ -503,7 +503,7 @@ class SampledRecord:
 
 @dataclass(frozen=True)
 class PosteriorFile:
-    """The posterior of a model's parameters given records, and how it was drawn."""
+    """The posterior of a model's parameters for its records, and how it was drawn."""
 
     format: Literal["psa_casadi.posterior/1"]
     package_version: str

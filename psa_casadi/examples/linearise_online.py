@@ -43,7 +43,7 @@ def main(folder: Path) -> dict[str, float]:
     }
     estimate = runs["tracked"].estimate
     if estimate is not None:
-        table["A found over the true one"] = estimate.parameters["A"] / (
+        table["estimate of A over its true value"] = estimate.parameters["A"] / (
             plant.values["A"] * drift(END)["A"]
         )
     return table

@@ -47,13 +47,13 @@ def main(folder: Path) -> dict[str, float]:
     """Withdraw the stack slowly and fast; return the least force and the largest gap; export it."""
     stack = psa.stack_model("P-885.51").plant()
     model = stack.with_components((*stack.components, LOAD))
-    found = {}
+    figures = {}
     for edge in (10e-3, 0.1e-3):  # s
         t = np.linspace(0.0, 15e-3, 3001)
         run = psa.simulate(model, t, 100.0 * (1.0 - np.clip((t - 2e-3) / edge, 0.0, 1.0)))
         gap = float((run.states["x_load"] - run.states["x"]).max())
         least = float(run.outputs["contact_force"].min())
-        found[f"least force, edge of {1e3 * edge:g} ms [N]"] = least
-        found[f"gap, edge of {1e3 * edge:g} ms [um]"] = 1e6 * max(gap, 0.0)
+        figures[f"least force, edge of {1e3 * edge:g} ms [N]"] = least
+        figures[f"gap, edge of {1e3 * edge:g} ms [um]"] = 1e6 * max(gap, 0.0)
     psa.export_fmu(psa.settled_at(model, 0.0), folder / "loose.fmu")
-    return found
+    return figures

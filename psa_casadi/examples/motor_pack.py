@@ -52,7 +52,7 @@ TURN = 10
 
 def phase_of(effect: str) -> psa.Parameter:
     """Return the phase of a wave over the angle."""
-    return psa.Parameter(f"{effect}_phase", 0.0, "rad", (-7.0, 7.0), "where the wave begins")
+    return psa.Parameter(f"{effect}_phase", 0.0, "rad", (-7.0, 7.0), "where the wave starts")
 
 
 cogging = psa.Component(

@@ -29,7 +29,7 @@ from psa_casadi.export.fmu.platforms import compile_library, host_platform
 from psa_casadi.export.fmu.sources import FMI_HEADERS
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.fmu import CO_SIMULATION
-from psa_casadi.export.importer.played import GIVEN, PLAYED, RUNS, Passed
+from psa_casadi.export.importer.played import PLAYED, RUNS, SUPPLIED, Passed
 from psa_casadi.export.importer.start_values import FmuPart, fmu_part, start_set
 from psa_casadi.model.component import Component, OnDemand
 from psa_casadi.model.compose import Model
@@ -120,7 +120,7 @@ def _wired(part: FmuPart, effects: dict[str, list[Component]]) -> ssp.WiredParts
     parts: dict[str, Model] = {}
     wires: list[ssp.Wire] = []
     if effects[_BEFORE]:
-        applied = [Output(GIVEN + i.name, i.unit, i.description) for i in inputs]
+        applied = [Output(SUPPLIED + i.name, i.unit, i.description) for i in inputs]
         parts[_BEFORE] = _side(part, _BEFORE, inputs, applied, effects[_BEFORE])
     parts[_ORIGINAL] = model.with_components([component])
     if effects[_BEHIND]:
@@ -131,7 +131,7 @@ def _wired(part: FmuPart, effects: dict[str, list[Component]]) -> ssp.WiredParts
         outer, end = ssp.Port(ssp.OUTSIDE, i.name), ssp.Port(_ORIGINAL, i.name)
         if effects[_BEFORE]:
             wires.append(ssp.Wire(outer, ssp.Port(_BEFORE, i.name)))
-            outer = ssp.Port(_BEFORE, GIVEN + i.name)
+            outer = ssp.Port(_BEFORE, SUPPLIED + i.name)
         wires.append(ssp.Wire(outer, end))
     for o in outputs:
         start, outer = ssp.Port(_ORIGINAL, o.name), ssp.Port(ssp.OUTSIDE, o.name)
@@ -245,17 +245,17 @@ class _Nested:
 
         inner = [w for w in self.wiring.wires if ssp.OUTSIDE not in (w.start.part, w.end.part)]
         ends = [(w.start, w.end) for w in inner]
-        shown, starts = [], []
+        references, starts = [], []
         for f in self.variables:
-            shown.append((archives[f.part].references[f.variable], order.index(f.part)))
+            references.append((archives[f.part].references[f.variable], order.index(f.part)))
             if f.start is not None:
                 kind = _KINDS.get(archives[f.part].elements[f.variable].type, "R")
-                starts.append((*shown[-1], kind, f.start))
+                starts.append((*references[-1], kind, f.start))
         return filled(
             "nested_config.h",
             parts=[(n, a.identifier, a.token, a.takes_lines) for n, a in archives.items()],
             wires=[(*map(reference, w), *(order.index(p.part) for p in w)) for w in ends],
-            shown=shown,
+            shown=references,
             starts=starts,
             token=token,
             target=host_platform(),
@@ -284,7 +284,7 @@ class _Nested:
         original = self.archives[_ORIGINAL]
         described = fmi.ModelDescription(
             fmiVersion="2.0", modelName=self.wiring.name, instantiationToken=token,
-            description="an FMU with what was found at its inputs and outputs",
+            description="an FMU with the identified effects at its inputs and outputs",
             generationTool=generation_tool(), variableNamingConvention="flat",
             defaultExperiment=original.description.defaultExperiment,
             coSimulation=fmi.CoSimulation(

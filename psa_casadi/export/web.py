@@ -34,7 +34,7 @@ from psa_casadi.simulation.compiler import (
 )
 from psa_casadi.simulation.exact.generate import generate
 from psa_casadi.simulation.exact.printing import Unprintable
-from psa_casadi.simulation.exact.run import ALIKE, AT, FINEST, LENGTHS, MOST
+from psa_casadi.simulation.exact.run import AT, EQUAL_STEPS, FINEST, LENGTHS, MOST
 from psa_casadi.simulation.exact.split import split_of
 from psa_casadi.simulation.simulate import (
     AGREE,
@@ -141,7 +141,7 @@ def _config(structure: Structure, by_input: ca.Function, *, exact: bool) -> str:
     numbers = {
         "EXACT": int(exact), "LADDER": f"{{{ladder}}}", "AGREE": AGREE, "TIGHTEST": TIGHTEST,
         "STILL": STILL, "STEP_SHARE": STEP_SHARE, "SMALLEST_RTOL": SMALLEST_STEP_RTOL,
-        "MOST": MOST, "AT": AT, "ALIKE": ALIKE, "LENGTHS": LENGTHS, "FINEST": FINEST,
+        "MOST": MOST, "AT": AT, "ALIKE": EQUAL_STEPS, "LENGTHS": LENGTHS, "FINEST": FINEST,
         "GAINS": len(gains), "SZ_ARG": max(4, by_input.sz_arg()), "SZ_RES": by_input.sz_res(),
         "SZ_IW": max(1, by_input.sz_iw()), "SZ_W": max(1, by_input.sz_w()),
     }  # fmt: skip

@@ -131,7 +131,7 @@ def identify(
                 best, determined, best.predicted(), by="psa identify", sampled=sampled
             )
             noise = noise_found(best, parts)
-            progress("what further records would tell")
+            progress("what further records would determine")
             advised = advice(best, determined, force_scale_given=inputs)
         except KeyboardInterrupt:
             current_work().wrap_up()
@@ -222,7 +222,7 @@ def _with_record_levels(best: Fit, progress: Progress) -> Fit:
         change = np.max(np.abs(np.log(np.array(levels) / np.array(best.sigma))))
         if best.interrupted or change < 0.02:
             break
-        progress("base fit with every record's own noise level")
+        progress("base fit with each record's noise level")
         try:
             best = refit(best, sigma=levels)
         except KeyboardInterrupt:

@@ -222,7 +222,7 @@ def retuned(best: Fit, progress: Progress, *, reached: float = np.inf) -> Fit:
         misfit = best.rms > reached or any(rms > _MISSED * level for rms, level in pairs)
         if best.interrupted or not misfit:
             return best
-        progress("base fit, mechanics again behind the force found")
+        progress("base fit, mechanics again behind the fitted force")
         try:
             better = _once(best)
         except KeyboardInterrupt:

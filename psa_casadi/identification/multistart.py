@@ -112,7 +112,7 @@ def search_starts(
     except PsaError as error:
         raise SimulationError(
             f"The model '{model.name}' cannot be simulated on these records from any start; check"
-            f" the units of its inputs, its values and their bounds. At its own values: {error}"
+            f" the units of its inputs, its values and their bounds. At its current values: {error}"
         ) from error
     cut = any(f.interrupted for _, f in ranked)
     ended = [

@@ -180,7 +180,7 @@ class _Reader:
     def define(self, name: str, value: Expression) -> None:
         """Give an expression a name; raises ValueError if it is taken."""
         if name in self.symbols or name in self._defined:
-            raise ValueError("is used before it stands there, or is the name of a symbol.")
+            raise ValueError("is used before it is defined, or is the name of a symbol.")
         self._defined[name] = value
 
     def expression(self, text: str) -> Expression:

@@ -104,7 +104,7 @@ def dumps(model: Model) -> str:
     what it declares. Raises InputError for equations that no text can have, two components of
     one name, and numbers and texts that no file can carry.
     """
-    origin, own = model.provenance, _written(model)
+    origin, written = model.provenance, _written(model)
     parameters = {
         p.name: {
             "value": model.values[p.name],
@@ -126,7 +126,7 @@ def dumps(model: Model) -> str:
             for c in model.effects
         ],
         "parameters": parameters,
-        **({"own": plain(own)} if own else {}),
+        **({"own": plain(written)} if written else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
         "force_scale": origin.force_scale,
@@ -195,11 +195,11 @@ def model_of(
         )
     declared = part(Mapping[str, OwnComponent], content.get("own", {})) or {}
     try:
-        own = components_of(declared, opener)
+        further = components_of(declared, opener)
     except InputError as error:
         _refuse(error.problems, source)
         raise
-    tables = {**COMPONENTS, **own}, {**known_effects(effects), **_FURTHER, **own}
+    tables = {**COMPONENTS, **further}, {**known_effects(effects), **_FURTHER, **further}
     _refuse(_problems(content, *tables), source)
     file = decode(ModelFile, content, source)
     components = [tables[0][name] for name in file.components]
@@ -311,7 +311,7 @@ def _parameter_problems(table: dict[str, Any], known: Iterable[Component]) -> It
         entry = part(ModelParameter, table[parameter.name])
         if entry and entry.unit not in ("", parameter.unit):
             yield (
-                f"'{parameter.name}' is given in {brief(entry.unit)}; convert it to"
+                f"'{parameter.name}' has the unit {brief(entry.unit)}; convert it to"
                 f" '{parameter.unit}'."
             )
         if entry and entry.interval and not entry.interval.low <= entry.interval.high:

@@ -49,7 +49,7 @@ def ode_model(
     intermediates: Sequence[Output | str] | None = None,
     values: Mapping[str, float] | None = None,
     description: str = "",
-    source: str = "given as a CasADi ODE",
+    source: str = "specified as a CasADi ODE",
 ) -> Model:
     """Return the model of x' = ode(t, x, u, p), y = y(t, x, u, p).
 
@@ -205,8 +205,8 @@ def _check_symbols(columns: Mapping[str, Expression]) -> None:
     for name, places in owners.items():
         if len(places) > 1:
             problems.add(
-                f"The symbol '{name}' stands {len(places)} times in {' and '.join(places)};"
-                " give every row a symbol and a name of its own."
+                f"The symbol '{name}' occurs {len(places)} times in {' and '.join(places)};"
+                " give every row a separate symbol and name."
             )
     known = {symbol.__hash__() for _, symbol in symbols}
     used = [(k, s) for k in EXPRESSIONS if k in columns for s in ca.symvar(columns[k])]

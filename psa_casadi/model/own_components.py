@@ -142,8 +142,8 @@ def refuse_large(components: Iterable[OwnComponent]) -> None:
     for (what, most), count in counts:
         if count > most:
             raise InputError(
-                f"its own components have {count} {what}, of which a file holds {most} at most;"
-                " simplify the model."
+                f"its user-defined components have {count} {what}, of which a file holds"
+                f" {most} at most; simplify the model."
             )
 
 

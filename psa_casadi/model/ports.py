@@ -232,7 +232,7 @@ def ported(component: Component, ports: frozenset[Port]) -> Component:
     if component.gain is not None or not here:
         return component
     acts = "what acts in the place of "
-    about = {"input": acts, "rate": "", "output": "what is shown of ", "parameter": acts}
+    about = {"input": acts, "rate": "", "output": "reading of ", "parameter": acts}
     balances = [*component.balances]
     for p in here:
         if p.kind in _BEFORE:

@@ -142,7 +142,7 @@ def _imported(module: str, *, here: bool = False) -> ModuleType:
             return import_module(module)
         except Exception as error:  # the user's code may raise anything
             raise InputError(
-                f"The module '{module}' with own effects cannot be imported"
+                f"The module '{module}' with your effects cannot be imported"
                 f" ({type(error).__name__}: {error}); name it as in `import {module or 'effects'}`,"
                 " from the folder that holds it."
             ) from error

@@ -128,7 +128,7 @@ class Provenance:
 class Publication:
     """Who made a model, which version it is, and on what terms it is passed on; "" if not stated.
 
-    The terms are those of the model and its values. The C code of an exported model has its own.
+    The terms are those of the model and its values. The C code of an exported model has others.
     """
 
     author: str = ""

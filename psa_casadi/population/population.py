@@ -297,8 +297,8 @@ def population(findings: Sequence[Finding]) -> Population:
     spreads = [_spread(findings, e) for e in every if len(e.places) > FEWEST]
     if not spreads:
         raise InputError(
-            f"No parameter is told by more than {FEWEST} of the {len(findings)} devices, so there"
-            " is no population to speak of; give more devices, or compare these side by side."
+            f"No parameter is determined by more than {FEWEST} of the {len(findings)} devices, so"
+            " there is no population; give more devices, or compare these side by side."
         )
     diagnosed = [f for f in findings if f.verdict]  # rivals are one cause
     causes = [" or ".join((c.effect, *c.or_else)) for f in diagnosed for c in f.causes]

@@ -136,12 +136,12 @@ def mixed_regression(
     x = np.ones((y.size, 1)) if columns is None else np.asarray(columns, dtype=float)
     if y.size <= x.shape[1]:
         raise InputError(
-            f"{y.size} devices cannot tell {x.shape[1]} figures and their spread; give more."
+            f"{y.size} devices cannot determine {x.shape[1]} figures and their spread; give more."
         )
     if not (np.all(np.isfinite(s)) and np.all(s > 0.0) and np.all(np.isfinite(y))):
         raise InputError("A standard error is not positive; leave that device out.")
     if np.linalg.matrix_rank(x) < x.shape[1]:
-        raise InputError("The groups or dates are not distinct enough to tell their effects.")
+        raise InputError("The groups or dates are not distinct enough to separate their effects.")
     unit = float(np.median(s))  # so that tau^2 is a number of ordinary size
     y, s = y / unit, s / unit
     dof = y.size - x.shape[1]
@@ -214,7 +214,7 @@ def outliers(theta: ArrayLike, errors: ArrayLike) -> Outliers:
     """
     y, s = np.asarray(theta, dtype=float), np.asarray(errors, dtype=float)
     if y.size <= FEWEST:
-        raise InputError(f"{y.size} devices have no outliers that could be told; give more.")
+        raise InputError(f"{y.size} devices are too few to detect outliers; give more.")
     apart = np.zeros(y.size, dtype=np.bool_)
     z, p, corrected = _tested(y, s, apart)
     for _ in range(_ROUNDS):
@@ -342,7 +342,9 @@ def drift(theta: ArrayLike, errors: ArrayLike, time: ArrayLike) -> Drift:
     """
     t = np.asarray(time, dtype=float)
     if np.ptp(t) == 0.0:
-        raise InputError("All devices have one date, so no drift can be told; give other dates.")
+        raise InputError(
+            "All devices have one date, so no drift can be determined; give other dates."
+        )
     span = float(np.ptp(t))
     x = np.column_stack([np.ones(t.size), (t - t.mean()) / span])
     fit = mixed_regression(theta, errors, x)

@@ -271,8 +271,8 @@ def _refuse(model: Model, chains: int, draws: int, tune: int, words: Iterable[st
     for word in words:
         if word not in _OWN or is_stack(model):
             problems.add(
-                f"'{word}' is not among the arguments for '{model.name}'; of a model of your"
-                f" own there are also {', '.join(_OWN)}."
+                f"'{word}' is not among the arguments for '{model.name}'; an ODE model"
+                f" also takes {', '.join(_OWN)}."
             )
     if chains < 1 or draws < 4 or tune < 1:
         problems.add(

@@ -286,8 +286,7 @@ def _refuse(model: Model, names: Sequence[str], values: Mapping[str, float]) -> 
     for name in values:
         if name not in names:
             problems.add(
-                f"A prior of '{name}' was given, which is not sampled; sampled are"
-                f" {', '.join(names)}."
+                f"'{name}' has a prior but is not sampled; sampled are {', '.join(names)}."
             )
     problems.raise_if_any()
 

@@ -119,6 +119,6 @@ def _check(time: FloatArray, low: float, high: float, frequency: float) -> None:
     highest = 0.5 * (time.size - 1) / float(time[-1] - time[0])
     if not 0 < frequency < highest:
         raise InputError(
-            f"{frequency:.6g} Hz cannot be shown on this time grid, which resolves up to "
+            f"{frequency:.6g} Hz cannot be resolved on this time grid, which reaches up to "
             f"{highest:.6g} Hz; choose a lower frequency or a finer grid."
         )

@@ -48,9 +48,9 @@ class Located:
         known = np.flatnonzero(np.isfinite(values))
         wrong = np.flatnonzero(np.diff(values[known]) <= 0)
         if wrong.size > LISTED:
-            first, stands = known[wrong[0] + 1], values[known[wrong]] == values[known[wrong + 1]]
+            first, repeats = known[wrong[0] + 1], values[known[wrong]] == values[known[wrong + 1]]
             what = f": the {place}s are not in the order of time; sort them by it."
-            what = f": their time stands still; remove repeated {place}s." if stands.all() else what
+            what = f": their time repeats; remove repeated {place}s." if repeats.all() else what
             self.problems.add(
                 f"{self.path}: column 'time': {wrong.size} of {values.size} {place}s are not later"
                 f" than the one before, {place} {lines[first]} the first of them{what}"
@@ -58,11 +58,11 @@ class Located:
             return
         for row, before in zip(known[wrong + 1], known[wrong], strict=True):
             now, last = values[row], values[before]
-            what = "stands still" if now == last else "goes back"
+            what = "repeats" if now == last else "goes back"
             self.problems.add(
                 f"{self.path}: {place} {lines[row]}, column 'time': time {what} (from {last:.9g} in"
                 f" {place} {lines[before]} to {now:.9g}), expected a later instant in every"
-                f" {place}; remove repeated {place}s or split the file where a new record begins."
+                f" {place}; remove repeated {place}s or split the file where a new record starts."
             )
 
     def check_displacement(self) -> None:

@@ -121,7 +121,7 @@ def without_gaps(
         what = f"the {inputs[0]}" if len(inputs) == 1 else "an input"
         sentences.append(
             f"{record.name}: no sample for {places}, while {what} moves: what it did there is"
-            f" not known, so that the {len(at) + 1} parts count as records of their own."
+            f" not known, so that the {len(at) + 1} parts count as separate records."
         )
     return parts, sentences
 
@@ -399,8 +399,8 @@ def excerpts(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
         texts.append(
             f"{record.name}: of {record.n} samples {PARTS} parts of {length} are used, which begin"
             f" at {places}: they have each kind of rise, fall and hold that fits into them, and"
-            f" tell nothing slower than a part, {lasts:.3g} s; give a record with fewer samples a"
-            " second for that."
+            f" resolve nothing slower than a part, {lasts:.3g} s; give a record with fewer samples"
+            " a second for that."
         )
     return result, texts
 

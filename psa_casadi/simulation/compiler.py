@@ -84,7 +84,7 @@ def zig_command() -> list[str]:
     """
     if not has_zig():
         raise MachineError(
-            "There is no C compiler to be found, which turns a model into a fast program: run "
+            "There is no C compiler, which turns a model into a fast program: run "
             f"`{INSTALL_ZIG}`, or install the system's compiler (on Debian and Ubuntu `apt install "
             "gcc libc6-dev`, on macOS `xcode-select --install`), or name one in CC."
         )

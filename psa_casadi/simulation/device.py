@@ -153,7 +153,7 @@ def _failures() -> Iterator[None]:
         yield
     except (MemoryError, RuntimeError) as error:
         raise MachineError(
-            f"The GPU failed ({error}); too little free memory (`nvidia-smi` says what holds it) or"
+            f"The GPU failed ({error}); too little free memory (`nvidia-smi` lists its users) or"
             " a CuPy without CUDA's compiler (`pip install 'psa-casadi[gpu]'` brings it) is the"
             f" likely cause: mend it, {_INSTEAD}"
         ) from error

@@ -382,7 +382,7 @@ def test_the_page_has_the_equation_and_the_parameters_of_every_effect() -> None:
 
 def test_the_help_of_both_faces_mentions_user_models() -> None:
     for face, word in ((psa.identify, "known_start"), (psa.diagnose, "leave_out")):
-        assert f"Of a model of your own, {face.__name__}(model: " in str(face.__doc__)
+        assert f"For your model, {face.__name__}(model: " in str(face.__doc__)
         assert str(face.__doc__).count(word) >= 2  # in the signature and in words
 
 
@@ -394,7 +394,7 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
         psa.identify(oscillator(), replace(quiet, columns={"position": quiet.time}))
     for inputs in ({"time": t, **alone}, {"time [s]": t, **alone, "Forces": t}):
         with pytest.raises(
-            psa.InputError, match=r"the column 'force' is missing \(found: time, pos"
+            psa.InputError, match=r"the column 'force' is missing \(present: time, pos"
         ):
             psa.identify(oscillator(), inputs)
     with pytest.raises(psa.InputError, match=r"no output of the model 'oscillator'"):
@@ -405,7 +405,7 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
         psa.story(_quiet(oscillator()))  # type: ignore[arg-type]
     with pytest.raises(psa.InputError, match=r"rows are not in the order of time"):
         psa.identify(oscillator(), {"time": t[::-1], "force": t, "position": t})
-    with pytest.raises(psa.InputError, match=r"'zero_off', which begins the name of no effect"):
+    with pytest.raises(psa.InputError, match=r"'zero_off', with which no effect's name starts"):
         psa.diagnose(
             oscillator(),
             {"time": t, "force": t, "position": t**2},

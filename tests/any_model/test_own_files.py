@@ -204,7 +204,7 @@ def _refused(records: Any, model: psa.Model | None = None) -> str:
         (("speed (rpm)", "speed [foo]"), "column 'Speed': the unit 'foo' is unknown"),
         (("Time [ms]", "Time [mm]"), "column 'time': the unit 'mm' does not measure time"),
         (("Time [ms]", "hours of work"), "'time' is missing.*--columns \"?time=hours of work:s"),
-        (("remark [V]", "Flow (m3/s)"), "column 6: 'flow' stands twice in the header"),
+        (("remark [V]", "Flow (m3/s)"), "column 6: 'flow' occurs twice in the header"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_with_what_to_type(
@@ -222,7 +222,9 @@ def test_all_mistakes_of_all_records_are_reported_at_once(tmp_path: Path) -> Non
     assert "bad.csv: line 2, column 'Speed': found 'x', expected a number" in statement
     assert "none.csv: there is no such file" in statement
     assert "int is no record; give the path of a file, a data frame" in statement
-    assert "record 4: column names: the column 'flow' is missing (found: time, valve)" in statement
+    assert (
+        "record 4: column names: the column 'flow' is missing (present: time, valve)" in statement
+    )
     statement = _refused({"time": T, "valve": VALVE, "flow": FLOW})
     assert "no output of the model 'pump' with eight samples or more; the model's are" in statement
 
@@ -402,7 +404,7 @@ def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
         psa.identify("record.csv", known_start=True)  # type: ignore[call-overload]
     with pytest.raises(psa.InputError, match=r"`leave_out` has 'slow_crep', which is no effect"):
         psa.diagnose("record.csv", leave_out=["slow_crep"])
-    with pytest.raises(psa.InputError, match=r"no effect; of the \d+ there are.* are lag"):
+    with pytest.raises(psa.InputError, match=r"name starts; of the \d+ there are.* are lag"):
         psa.diagnose(motor(), record, leave_out=["lagg"], starts=1)
 
 

@@ -78,7 +78,7 @@ def test_the_playground_and_a_posterior_take_a_model(
     text = command("sample", *words).err
     assert text.startswith(f"Error: {tmp_path / 'absent.csv'}: there is no")
     without = command("sample", tmp_path / "absent.csv")
-    assert "No model is given; add --model MODEL.json" in without.err
+    assert "The model is missing; add --model MODEL.json" in without.err
 
 
 def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,7 +45,7 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
     [
         (("identfy",), "identfy"),
         (("simulate", "--stack", "demo"), "--input"),
-        (("simulate", "--input", "{demo}", "-o", "{out}"), "No model is given; add --model"),
+        (("simulate", "--input", "{demo}", "-o", "{out}"), "The model is missing; add --model"),
         (("simulate", "--stack", "p885", "--input", "{demo}", "-o", "{out}"), "mean P-885.51?"),
         (("simulate", "--model", "{bytes}", "--input", "x", "-o", "{out}"), "it is no text in"),
         (("diagnose",), "records"),
@@ -54,12 +54,12 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
         (("compare", "{absent}", "b.json"), "absent.csv: cannot be read"),
         (("export", "fmu", "--stack", "P-1", "-o", "{out}"), "P-1"),
         (("export", "fmu", "--stack", "xyzzy", "-o", "{out}"), "there are PTBS200, WYDS0808020"),
-        (("export", "fmu", "--stack", "demo", "--model", "m", "-o", "{out}"), "are both given"),
+        (("export", "fmu", "--stack", "demo", "--model", "m", "-o", "{out}"), "exclude each other"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--platforms", "vax"), "'vax'"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--name", "1st"), "'1st' cannot"),
         (("export", "fmu", "--stack", "demo", "-o", "{out}", "--fmi", "7"), "--fmi"),
         (("export", "fmu", "--stack", "demo", "-o", "{folder}/no/x.fmu"), "create it first"),
-        (("export", "ssp", "--model", "m", "--stack", "demo", "-o", "{out}"), "both given"),
+        (("export", "ssp", "--model", "m", "--stack", "demo", "-o", "{out}"), "exclude each other"),
         (("export", "ssp", "--stack", "P-885.51", "--platforms", "vax", "-o", "{out}"), "vax"),
         (("export", "ssp", "--stack", "P-1", "-o", "{folder}/no/x.ssp", "--picture", "w.gif"),
          "3 problems"),
@@ -77,7 +77,7 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
         (("identify", "{good}", "-o", "{good}"), "would overwrite an input"),
         (("design", "mechanism", "--stack", "demo", "--damping", "2", "-o", "{out}"), "2"),
         (("design", "mechanism", "--stack", "PTBS200", "--poles", "fast", "-o",
-          "{folder}/no/m.json", "--max-stroke-loss", "much"), "3 problems with what was given"),
+          "{folder}/no/m.json", "--max-stroke-loss", "much"), "3 problems with the input"),
         (("design", "mechanism", "--stack", "demo", "--damping", "0.5", "--max-force", "inf",
           "-o", "{out}"), "The largest force is inf N; give a positive one"),
         (("design", "experiment", "--stack", "demo", "--duration", "1", "--samples", "0",
@@ -341,7 +341,7 @@ def test_a_users_effects_are_searched_in_a_users_model(
 def test_what_a_users_model_does_not_have_is_refused(tmp_path: Path) -> None:
     model, record, arguments = _oven(tmp_path)
     text = refused("identify", record, *arguments, "--profile", "T", "--columns", "warmth=w")
-    assert "--profile is not there for a model of your own" in text
+    assert "--profile does not apply to your model" in text
     assert "'w', which --columns names for 'warmth', is not in the header" in text
     assert "oven.py has no function 'mak'" in refused("diagnose", record, "--model", f"{model}:mak")
     text = refused("diagnose", record, "--model", model)
@@ -349,7 +349,7 @@ def test_what_a_users_model_does_not_have_is_refused(tmp_path: Path) -> None:
     assert "it has 'make', as" in text
     assert "there is no file" in refused("diagnose", record, "--model", "none.py:make")
     text = refused("identify", record, "--hold", "zero")
-    assert "--hold is said of a model of your own; add --model FILE.py:FUNCTION." in text
+    assert "--hold applies to your model; add --model FILE.py:FUNCTION." in text
     (tmp_path / "bad.py").write_text("1 / 0", encoding="utf-8")
     text = refused("identify", record, "--model", tmp_path / "bad.py")
     assert "bad.py cannot make a model (ZeroDivisionError: division by zero)" in text

@@ -351,7 +351,7 @@ def test_a_file_of_a_users_model_is_simulated_and_no_stacks_command_takes_it(
     assert "give NAME=VALUE" in refused(*plan, "--value", "k", folder=tmp_path)
     for words in (("web", "-o", tmp_path / "w.html"), ("export", "ssp", "-o", tmp_path / "w.ssp")):
         text = refused(*words, "--model", tmp_path / "m.json", folder=tmp_path)
-        assert "A model of your own is for `psa identify`," in text
+        assert "Other models are for `psa identify`," in text
 
 
 def test_equations_of_a_model_file_run_no_code(tmp_path: Path) -> None:

@@ -113,7 +113,7 @@ def test_a_folder_is_taken_as_it_is_or_refused(
 ) -> None:
     publish("http://127.0.0.1:9/table.dat", TABLE)
     monkeypatch.setenv(DATA_VARIABLE, str(tmp_path))
-    with pytest.raises(InputError, match=r"part\.csv: there is no such file, and PSA_CASADI_DATA"):
+    with pytest.raises(InputError, match=r"part\.csv: there is no such file, but PSA_CASADI_DATA"):
         datasets.load("small")
     path = tmp_path / "small" / "part.csv"
     path.parent.mkdir()

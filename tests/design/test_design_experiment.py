@@ -81,7 +81,7 @@ def test_all_that_is_wrong_with_limits_is_reported_at_once() -> None:
     assert len(caught.value.problems) == 4
     with pytest.raises(psa.InputError, match="no whole cycle"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=0.5)
-    with pytest.raises(psa.InputError, match="cannot be shown"):
+    with pytest.raises(psa.InputError, match="cannot be resolved"):
         Limits(0.0, 100.0, 1.0, 100, bandwidth=80.0)
 
 
@@ -291,7 +291,7 @@ def test_the_command_reports_all_mistakes_at_once(tmp_path: Path) -> None:
         "design", "experiment", "--separate", "creeping", "--noise", "-1", "--starts", "0",
         "-o", tmp_path / "no" / "where.csv",
     )  # fmt: skip
-    for part in ("creeping", "--noise", "--starts", "does not exist", "No model is given"):
+    for part in ("creeping", "--noise", "--starts", "does not exist", "The model is missing"):
         assert part in output
 
 
@@ -376,7 +376,7 @@ def test_with_the_designed_record_the_cause_is_named(loop: Loop) -> None:
     assert d.verdict in ("cause_named", "partly_explained")
     assert d.causes[0].effect == HIDDEN
     assert d.causes[0].cannot_be_told_from == ()
-    with pytest.raises(psa.InputError, match="nothing to tell apart"):
+    with pytest.raises(psa.InputError, match="nothing to separate"):
         resolving_experiment(d)
 
 

@@ -75,7 +75,7 @@ def _size_test(
         1.0,
         lengths=lengths,
         detection_limit=0.0,
-        own=own,
+        from_residual=own,
         alarms_below=1e-3,
     ).p_value
 

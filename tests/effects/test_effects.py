@@ -409,7 +409,7 @@ def test_loops_of_bouc_wen_keep_it(tmp_path: Path) -> None:
 
 def test_a_model_without_hysteresis_has_no_other_form() -> None:
     bare = compose([c for c in BASE if c.name != "bouc_wen"])
-    with pytest.raises(psa.InputError, match="no hysteresis of its own"):
+    with pytest.raises(psa.InputError, match="no hysteresis that could"):
         forms_of(bare, "spectrum")
 
 

@@ -276,7 +276,7 @@ def test_another_run_and_other_files_are_detected(tmp_path: Path) -> None:
         evidence.PAGE: lambda c: c.replace(b"held-out", b"hold-out"),
     }
     path = rewritten(evident_fmu(), tmp_path / "m.fmu", changes)
-    wrong = [f"{evidence.PAGE} is not what the model says"]
+    wrong = [f"{evidence.PAGE} differs from the model"]
     for fmu, problems in ((path, wrong), (evident_fmu(), [])):
         with Archive(fmu) as archive:
             assert list(wrong_evidence(archive, carried(path))) == problems

@@ -261,7 +261,7 @@ NAMES: dict[str, tuple[Change, str]] = {
     "a drive": (_named("C:/outside"), "leads outside"),
     "backslashes": (_named("..\\outside"), "leads outside"),
     "control characters": (_named("resources/a\x1b[2Jb"), "control characters"),
-    "other case": (_named("resources/a", "resources/A"), "stands for 2 entries"),
+    "other case": (_named("resources/a", "resources/A"), "names 2 entries"),
     "a link": (_of_kind(stat.S_IFLNK), "is a link or a device"),
     "a device": (_of_kind(stat.S_IFCHR), "is a link or a device"),
 }

@@ -14,14 +14,14 @@ from tests.tiers import slow_but
 
 #: The row that each fault fails, and its remark.
 FAULTS = {
-    1: ("start values", "'k' starts at 2.5, its description says 2"),
+    1: ("start values", "'k' starts at 2.5, its description has 2"),
     2: ("values are taken", "'k' was set to 2.02 and is 2"),
     3: ("life cycle", "after a reset it gives other results"),
     4: ("several instances", "two instances disturb each other in step 1"),
     5: ("memory", "bytes left by each of 1000 cycles"),
     6: ("state saved", "a state that is restored replays"),
     7: ("derivatives", "that of 'der(x)' is"),
-    8: ("dependencies", "'y' depends on 'u', which is not told"),
+    8: ("dependencies", "'y' depends on 'u', which is not declared"),
     9: ("step sizes", "fmi2DoStep returned status 3"),
     10: ("description valid", "InitialUnknowns"),
     11: ("instances", "the FMU gives no instance"),

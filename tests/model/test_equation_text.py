@@ -168,7 +168,7 @@ def test_parts_cannot_grow_beyond_what_is_written() -> None:
 
 @pytest.mark.parametrize("where", [{"b": "c", "c": "x"}, {"x": "y", "b": "x", "y": "1"}])
 def test_parts_stand_in_the_order_of_their_dependence(where: dict[str, str]) -> None:
-    with pytest.raises(psa.InputError, match="before it stands there"):
+    with pytest.raises(psa.InputError, match="before it is defined"):
         read("b", **where)
 
 

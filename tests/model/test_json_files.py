@@ -190,7 +190,7 @@ def test_what_the_other_components_need_is_named() -> None:
 def test_a_name_twice_is_no_choice_of_the_last() -> None:
     text = TEXT.replace('"k_L": {', '"k_L": {"value": 1e-3, "unit": "N/V"},\n    "k_L": {', 1)
     (problem,) = sentences(lambda: loads(text))
-    assert "the name 'k_L' stands twice in one object" in problem
+    assert "the name 'k_L' occurs twice in one object" in problem
 
 
 def test_many_mistakes_are_listed_up_to_twenty() -> None:

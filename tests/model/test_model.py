@@ -285,7 +285,9 @@ def test_two_components_of_one_name_are_not_saved() -> None:
 
 def test_what_could_not_be_read_again_is_not_saved() -> None:
     x = ca.SX.sym("x", 1_001)
-    with pytest.raises(psa.InputError, match=r"cannot be saved as MODEL\.json: its own components"):
+    with pytest.raises(
+        psa.InputError, match=r"cannot be saved as MODEL\.json: its user-defined components"
+    ):
         dumps(psa.ode_model({"x": x, "ode": -x, "y": x}, name="many"))
 
 

@@ -216,9 +216,9 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     ),
     "matrix": (lambda: {"x": X, "ode": X, "y": ca.SX(2, 2) + X}, {}, "'y' is 2 by 2"),
     "both kinds": (lambda: {"x": X, "p": ca.MX.sym("k"), "ode": X}, {}, "mixes SX and MX"),
-    "symbol twice": (lambda: {"x": X, "p": X, "ode": X}, {}, "'x' stands 2 times in x and p"),
+    "symbol twice": (lambda: {"x": X, "p": X, "ode": X}, {}, "'x' occurs 2 times in x and p"),
     "two symbols of one name": (
-        lambda: {"x": X, "p": ca.SX.sym("x"), "ode": X}, {}, "a name of its own"),
+        lambda: {"x": X, "p": ca.SX.sym("x"), "ode": X}, {}, "a separate symbol and name"),
     "expression for a symbol": (lambda: {"x": 2 * X, "ode": X}, {}, "must be symbols"),
     "two times": (lambda: {"x": X, "t": ca.SX.sym("t", 2), "ode": X}, {}, "time is one symbol"),
     "not linear": (

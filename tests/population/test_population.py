@@ -335,7 +335,7 @@ def test_the_pictures_name_the_devices_of_the_table() -> None:
     spread = next(s for s in result.spreads if s.estimates.name == "k_L")
     for plot in (spread_plot(result, spread), drift_plot(result, spread)):
         others, apart = plot.data
-        assert apart["name"] == "stands out"
+        assert apart["name"] == "outlier"
         assert [t.strip() for t in apart["text"]] == apart["hovertext"] == ["d5"]
         assert (len(others["x"]), set(others["text"])) == (39, {""})
     axis = spread_plot(result, spread).layout["xaxis"]

@@ -248,7 +248,7 @@ def test_the_command_finds_the_truth(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_sampled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(psa.InputError, match="'tau' was given, which is not sampled"):
+    with pytest.raises(psa.InputError, match="'tau' has a prior but is not sampled"):
         psa.sample(TRUTH, record(), free=["k_L"], prior={"tau": 1.0})
 
     def absent(name: str) -> None:
@@ -342,7 +342,7 @@ def test_what_a_user_model_does_not_take_is_refused() -> None:
         psa.sample(motor(), records(1), hysteresis="friction")
     with pytest.raises(psa.InputError, match="'starts' is not among the arguments for"):
         psa.sample(psa.stack_model("demo"), "record.csv", starts=3)
-    with pytest.raises(psa.InputError, match="'tau' was given, which is not sampled"):
+    with pytest.raises(psa.InputError, match="'tau' has a prior but is not sampled"):
         psa.sample(motor(), records(1), prior={"tau": 1.0})
     empty = replace(records(1)[0], columns={"voltage": records(1)[0].columns["voltage"]}, sha256="")
     with pytest.raises(psa.InputError, match="no output of the model 'motor'"):
@@ -362,4 +362,4 @@ def test_the_command_samples_a_user_model(tmp_path: Path) -> None:
     assert list(json.loads(files[1].read_text("utf-8"))["parameters"]) == ["R", "k"]
     assert all(file.stat().st_size for file in files)
     output = refused("sample", tmp_path / "run.csv", "--known-start", "--free", "R")
-    assert "--known-start is said of a model of your own; add --model" in output
+    assert "--known-start applies to your model; add --model" in output

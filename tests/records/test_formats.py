@@ -115,7 +115,7 @@ def test_columns_of_a_csv_file_under_other_names(tmp_path: Path) -> None:
     assert "line 1, column 'LVDT': the header gives the unit 'um', --columns gives 'mm'" in problem
     (problem,) = problems_of(path, columns="time=t,displacement=LVTD")
     assert "'LVTD', which --columns names for 'displacement', is not in the header" in problem
-    assert "(found: time, voltage, amp out, LVDT)" in problem
+    assert "(present: time, voltage, amp out, LVDT)" in problem
     (problem,) = problems_of(
         write(tmp_path / "c.csv", "time [s],voltage [V],y", *ROWS), columns="displacement=y"
     )
@@ -140,8 +140,8 @@ def test_options_for_one_file_apply_to_all(tmp_path: Path) -> None:
         ("voltage=", "'voltage=': is not understood"),
         ("voltag=u", "'voltag' is no column of a record; is 'voltage' meant?"),
         ("torque=u", "'torque' is no column of a record; there are time, voltage"),
-        ("voltage=u,voltage=v", "'voltage=v': 'voltage' is given twice"),
-        ("a.csv@voltage=u,a.csv@voltage=v", "'a.csv@voltage' is given twice"),
+        ("voltage=u,voltage=v", "'voltage=v': 'voltage' is specified twice"),
+        ("a.csv@voltage=u,a.csv@voltage=v", "'a.csv@voltage' is specified twice"),
         ("voltage=u:um", "the unit 'um' does not measure voltage"),
         ("voltage=u:vlots", "the unit 'vlots' is unknown"),
         ("voltage=u:", "has no unit"),
@@ -186,7 +186,7 @@ def test_files_that_differ_from_their_ending(tmp_path: Path) -> None:
         (problem,) = problems_of(kept(tmp_path / name, content))
         assert f"is no readable {kind} file" in problem
     empty = mat(tmp_path / "empty.mat", {"note": "nothing"})
-    assert "the column 'time' is missing (found: nothing)" in problems_of(empty)[0]
+    assert "the column 'time' is missing (present: nothing)" in problems_of(empty)[0]
 
 
 def test_a_missing_optional_package_is_named(

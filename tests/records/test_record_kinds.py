@@ -222,7 +222,7 @@ def test_packets_have_no_separate_time(tmp_path: Path) -> None:
     packets = table(HEAD, columns=(np.tile([0.0, 1e-5], N // 2), V, X))
     path = written(tmp_path, packets)
     statement = refused(path)
-    assert "the time begins anew every 2 lines" in statement
+    assert "the time restarts every 2 lines" in statement
     assert offered(statement) == {"sample_time": 1e-3}
     is_read(read_record(path, sample_time=4e-4))
 

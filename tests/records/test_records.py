@@ -120,7 +120,7 @@ def test_writing_refuses_what_could_not_be_read_back(tmp_path: Path) -> None:
     ("column", "values", "sentence"),
     [
         ("time", T[::-1], "sample 1 the first of them: the samples are not in the order of time"),
-        ("time", np.zeros(24), "sample 1 the first of them: their time stands still"),
+        ("time", np.zeros(24), "sample 1 the first of them: their time repeats"),
         ("voltage", np.where(T < 1.0, np.nan, T), "sample 0, column 'voltage': found no value"),
         ("current", np.full(24, np.inf), "column 'current': found inf, expected a finite number"),
         ("displacement", np.full(24, 1e200), "expected a measured number, below 1e[+]100"),
@@ -196,7 +196,7 @@ def test_what_the_grid_cannot_show_is_refused() -> None:
         partial(decaying_triangle, TIME, 0.0, 1.0, 1000),
         partial(multisine, TIME, 0.0, 1.0, (1.0, 501.0), seed=0),
     ):
-        with pytest.raises(InputError, match=r"cannot be shown .* up to 500 Hz"):
+        with pytest.raises(InputError, match=r"cannot be resolved .* up to 500 Hz"):
             call()
     with pytest.raises(InputError, match="low below high"):
         sine(TIME, 1.0, 1.0, 1.0)
@@ -250,7 +250,10 @@ def with_row(row: int, text: str) -> list[str]:
 @pytest.mark.parametrize(
     ("header", "expected"),
     [
-        ("time [s],displacement [um]", r"line 1: the column 'voltage' is missing \(found: time, d"),
+        (
+            "time [s],displacement [um]",
+            r"line 1: the column 'voltage' is missing \(present: time, d",
+        ),
         ("time [s],voltge [V],displacement [um]", r"'voltge' is unknown; if 'voltage' is meant"),
         (f"{HEADER},load_fource [N]", r"'load_fource' is unknown; if 'load_force' is meant"),
         ("time [s],voltage [vlot],displacement [um]", r"'vlot' is unknown; units of voltage .*kV"),
@@ -261,7 +264,7 @@ def with_row(row: int, text: str) -> list[str]:
             "time [s],voltage [V],displacement [V]",
             r"not measure length; .* um, nm, pm, counts, or say what 1 in",
         ),
-        (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' stands twice .*\(first as column 2\)"),
+        (f"{HEADER},Voltage [mV]", r"column 4: 'voltage' occurs twice .*\(first as column 2\)"),
         (
             f"time [s],voltage [V],displacement [um{'9' * 500}]",
             r"line 1, column 'displacement': 'um9{58}' is not a unit string; write symbols",
@@ -290,7 +293,7 @@ def test_mistakes_of_the_header(tmp_path: Path, header: str, expected: str) -> N
         ("0.004,inf,1", "line 6, column 'voltage': found inf, expected a finite number"),
         ("0.004,1,-inf", "line 6, column 'displacement': found -inf, expected a finite number"),
         ("0.004,1e101,1", "line 6, column 'voltage': found 1e+101, expected a measured number"),
-        ("0.003,1,1", "line 6, column 'time': time stands still (from 0.003 in line 5 to 0.003)"),
+        ("0.003,1,1", "line 6, column 'time': time repeats (from 0.003 in line 5 to 0.003)"),
         ("0.002,1,1", "line 6, column 'time': time goes back (from 0.003 in line 5 to 0.002)"),
         ("0.004,1", "line 6: found 2 cells, expected 3 as in the header"),
         ("0.004,1,1,1", "line 6: found 4 cells, expected 3 as in the header"),
@@ -333,7 +336,7 @@ def test_decimal_commas_between_commas_are_not_a_row_too_long(
 @pytest.mark.parametrize(
     ("order", "problem"),
     [
-        ([k for n in range(30) for k in (n, n)], "their time stands still; remove repeated lines"),
+        ([k for n in range(30) for k in (n, n)], "their time repeats; remove repeated lines"),
         (range(30)[::-1], "the lines are not in the order of time; sort them by it"),
     ],
 )
@@ -383,7 +386,7 @@ def test_files_that_are_no_csv_are_named_with_the_reason(tmp_path: Path) -> None
         "empty.csv": "the file is empty",
         "comments.csv": "holds no header and no data",
         "binary.csv": "is not text but a binary file",
-        "wide.csv": "begins as UTF-16 text and is none",
+        "wide.csv": "starts as UTF-16 text and is none",
     }
     for name, reason in reasons.items():
         (problem,) = problems_of(tmp_path / name)

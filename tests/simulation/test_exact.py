@@ -237,8 +237,8 @@ def test_every_effect_splits(base: tuple[psa.Component, ...]) -> None:
 @pytest.mark.parametrize(
     ("component", "reason"),
     [
-        (KINK, r"kink of their own \(contact\)"),
-        (FEEDBACK, r"kink of their own \(voltage_reversal\)"),  # u' is a driver's rate no more
+        (KINK, r"another kink \(contact\)"),
+        (FEEDBACK, r"another kink \(voltage_reversal\)"),  # u' is a driver's rate no more
         (SOFTER, "a hysteresis lies in a loop"),
         (JUMP, "jump"),  # its derivative is 0 wherever there is one
     ],

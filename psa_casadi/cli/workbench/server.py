@@ -47,7 +47,7 @@ _DOOR = (
     '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>Diagnose records</title>'
     f"</head><body><p><a href='/'>Open the page</a></p><script>{_ENTER}</script></body></html>\n"
 )
-#: What a browser must refuse: scripts and styles but the page's own, requests to others, a
+#: What a browser must refuse: scripts and styles other than the page's, requests to others, a
 #: frame around the page.
 _PAGE_POLICY = {
     "Content-Security-Policy": (
@@ -56,7 +56,7 @@ _PAGE_POLICY = {
         " frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
     )
 }
-#: A report is a page of its own that runs its scripts and can reach nothing here, not even by the
+#: A report is a separate page that runs its scripts and can reach nothing here, not even by the
 #: cookie; in addition its policy holds.
 _REPORT_POLICY = {
     "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'self'"

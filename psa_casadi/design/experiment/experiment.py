@@ -372,7 +372,7 @@ def resolving_experiment(
     if d.verdict != "ambiguous" or len(d.contenders) < 2:
         raise InputError(
             f"The verdict is {d.verdict} with {len(d.contenders)} fitted rivals, so there is"
-            " nothing to tell apart; name the effects with --separate instead."
+            " nothing to separate; name the effects with --separate instead."
         )
     contenders, _ = one_of_each(d.contenders)
     if len(contenders) < 2 or (limits is not None and not _slow(limits)):

@@ -72,7 +72,7 @@ class Limits:
             )
         elif self.band > 0.5 * self.samples / self.duration:
             problems.add(
-                f"A bandwidth of {self.band:g} Hz cannot be shown by {self.samples} samples in"
+                f"A bandwidth of {self.band:g} Hz cannot be resolved by {self.samples} samples in"
                 f" {self.duration:g} s; sample at {2.0 * self.band:g} Hz or faster, or narrow it."
             )
         problems.raise_if_any()

@@ -161,7 +161,7 @@ def noise_of(
     for name, rms in rms_by_output.items():
         if name not in names or not rms > 0.0:
             raise InputError(
-                f"The noise of '{name}' is given as {rms:g}; give a positive rms of one of"
+                f"The noise of '{name}' is {rms:g}; give a positive rms of one of"
                 f" {', '.join(names)}."
             )
     if len(rms_by_output) < len(names):

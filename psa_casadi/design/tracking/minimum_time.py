@@ -266,8 +266,9 @@ def quickest_move(
     best = min(plays[_FREE:], key=lambda p: p.distance)
     if not best.distance < 1e-2:
         raise PsaError(
-            "No quickest move was found: the trials on the simulator do not settle. Effects that"
-            " outweigh the linear part are the likely cause; use a path (--target) instead."
+            "The search for the quickest move failed: the trials on the simulator do not settle."
+            " Effects that outweigh the linear part are the likely cause; use a path"
+            " (--target) instead."
         )
     return QuickMove(
         begin, end, limits, best.length, best.length / intervals, linear_time, best.response,

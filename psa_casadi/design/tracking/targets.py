@@ -305,7 +305,7 @@ def move_start(model: Model, begin: float, end: float, limits: AmplifierLimits) 
     demand_stack(model)
     problems = Problems()
     if begin == end:
-        problems.add("The move begins where it ends; name two positions.")
+        problems.add("The move starts where it ends; name two positions.")
     if not np.isfinite([limits.min_voltage, limits.max_voltage]).all():
         problems.add(
             "A quickest move uses the whole voltage range; give both limits of the voltage."

@@ -220,7 +220,7 @@ class Program:
         off = np.maximum(np.array(solution["g"]).ravel() - self._high, 0.0)
         if not stats["success"] and not np.max(off) < _FEASIBLE:
             raise NoSolutionError(
-                f"IPOPT found no voltage ({stats['return_status']}). Limits that leave the path no"
+                f"IPOPT failed ({stats['return_status']}). Limits that leave the path no"
                 " room, or a path far beyond the stack's bandwidth, are the likely cause; widen"
                 " the limits or slow the path down."
             )
@@ -380,8 +380,8 @@ def _chosen(
             return response, error, predicted, True, best.converged
     elif exceeds_limits(cut.response, limits):
         raise PsaError(
-            "No voltage within the limits was found that comes near the path; widen the limits or"
-            " slow the path down."
+            "The search gave no voltage within the limits that comes near the path; widen the"
+            " limits or slow the path down."
         )
     return cut.response, cut.error, cut.response.displacement, False, False
 

@@ -135,8 +135,8 @@ class _Search:
 
     def is_small(self, h: Hypothesis) -> bool:
         """Whether causes are so small relative to the noise that others may be as likely."""
-        shown = CauseEvidence(self.known.scale.evidence(h), len(h.fit.residuals))
-        return bool(h.causes) and shown.listed_probability(self.task.limits) < _SURELY
+        evidence = CauseEvidence(self.known.scale.evidence(h), len(h.fit.residuals))
+        return bool(h.causes) and evidence.listed_probability(self.task.limits) < _SURELY
 
     def rejected(self) -> Hypothesis | None:
         """Return the best of what held-out samples reject that may lack a cause.
@@ -335,7 +335,7 @@ class _Search:
         if not self.once("ringing", h.names):
             return False
         rung = base_fit.ringing(h.fit)
-        if rung is None or rung.decrease < base_fit.SEEN:
+        if rung is None or rung.decrease < base_fit.LEAST_DECREASE:
             return False
         if view.shows and rung.decrease < _RINGING * view.decrease:
             return False

@@ -176,12 +176,12 @@ def noisy(of: Hypothesis, task: Task) -> Hypothesis:
     """Return a hypothesis with noise that enters its model, if that is likelier."""
     if task.pack.is_stack:
         return of  # noise of any colour is the sensor's
-    own = []
+    colours = []
     for k, (f, colour) in enumerate(zip(of.fit.channels, of.colours, strict=True)):
         pairs = zip(of.experiments, of.predictions, strict=True)
         errors = [e.errors(f.number, y[:, k]) for e, y in pairs]
-        own.append(entering(of.fit, errors, k, colour))
-    return replace(of, colours=tuple(own))
+        colours.append(entering(of.fit, errors, k, colour))
+    return replace(of, colours=tuple(colours))
 
 
 def root_of(base: Fit, task: Task) -> Hypothesis:
@@ -316,9 +316,9 @@ class View:
 
         With a cause the test must alarm too: the error of the cause's form shows in directions.
         """
-        fit, asked = self.of.fit, self.test.alarm or not self.of.causes
+        fit, needed = self.of.fit, self.test.alarm or not self.of.causes
         significant = self.decrease >= self.screening.threshold
-        return significant and self.pack.shows(fit, self.promise, self.test) and asked
+        return significant and self.pack.shows(fit, self.promise, self.test) and needed
 
     @property
     def leaves(self) -> bool:
@@ -351,7 +351,7 @@ def examine(of: Hypothesis, task: Task, known: Sequence[Direction] = ()) -> View
         tested = [c.tested for c in of.colours]
         residuals, (colour, *others) = [r for r, _ in tested], [c for _, c in tested]
         colour = replace(colour, further=tuple(others))
-    test = task.pack.tested(fit, residuals, colour, task.limits, own=alone)
+    test = task.pack.tested(fit, residuals, colour, task.limits, from_residual=alone)
     coloured = alone and any(c.autoregression.size for c in of.colours)
     if coloured and kept and not task.pack.is_stack and not test.alarm:
         test = _asked(fit, kept, colour, test, task.limits)

@@ -115,20 +115,20 @@ class SearchState:
         self.hypotheses[h.names] = ordered = replace(h, causes=tuple(causes))
         return ordered
 
-    def note(self, found: Hypothesis | None) -> None:
+    def note(self, h: Hypothesis | None) -> None:
         """Keep a hypothesis if it is the best of its causes, and held-out samples do not object.
 
         Another minimum may explain the fitted samples as well and fail between them.
         """
-        if found is None:
+        if h is None:
             return
-        old, evidence = self.hypotheses.get(found.names), self.scale.evidence
-        gained = np.inf if old is None else evidence(found) - evidence(old)
-        ahead = 0.0 if old is None else self.scale.held_out(found, old)
+        old, evidence = self.hypotheses.get(h.names), self.scale.evidence
+        gained = np.inf if old is None else evidence(h) - evidence(old)
+        ahead = 0.0 if old is None else self.scale.held_out(h, old)
         if gained > _SAME and gained + ahead > 0.0:
-            causes = found.causes if old is None else old.causes
-            kept = replace(found, causes=causes)
-            self.hypotheses[found.names] = kept if causes else noisy(kept, self.task)
+            causes = h.causes if old is None else old.causes
+            kept = replace(h, causes=causes)
+            self.hypotheses[h.names] = kept if causes else noisy(kept, self.task)
             self.notify(kept, "finished" if kept.final else "fitted")
 
     def notify(self, h: Hypothesis, state: State) -> None:
@@ -535,6 +535,6 @@ def fitted_rivals(base: Fit, task: Task) -> tuple[Contender, ...]:
     if lost:
         raise InputError(
             f"{', '.join(sorted(lost))} could not be fitted to these records, so there is nothing"
-            " to tell apart; leave the records out to design from ordinary sizes."
+            " to separate; leave the records out to design from ordinary sizes."
         )
     return chosen

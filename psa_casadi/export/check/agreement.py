@@ -370,7 +370,7 @@ def _played(fmu: Fmu, p: Playback) -> FloatArray:
         return np.asarray(values[np.isin(points, knots), 0])
 
     def divided(parts: int) -> FloatArray:
-        """Return points at which inputs move little, and so many times as many."""
+        """Return points between which inputs move little; `parts` multiplies their number."""
         counts = parts * np.clip(np.ceil(moved / _STEP), 1, _MOST_PARTS).astype(int)
         ends = zip(knots, knots[1:], counts, strict=False)
         steps = [np.linspace(a, b, m, endpoint=False) for a, b, m in ends]

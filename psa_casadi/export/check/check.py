@@ -110,7 +110,7 @@ def check_fmu(
     path = Path(path)
     if portable and not binaries.has_lief():
         raise InputError(
-            "What a binary needs of its system is not seen without lief; run `pip install lief`,"
+            "What a binary needs of its system is unknown without lief; run `pip install lief`,"
             " or leave --portable out."
         )
     _demand_zip(path)

@@ -18,8 +18,8 @@ from psa_casadi.model.evidence import RecordRun
 from psa_casadi.records.record import Record
 
 _NONE = (
-    "the model says nothing of its records and errors; identify or diagnose it with this version of"
-    " psa_casadi, and export it again"
+    "the model holds no evidence of its records and errors; identify or diagnose it with this"
+    " version of psa_casadi, and export it again"
 )
 
 
@@ -32,7 +32,7 @@ def wrong_evidence(archive: Archive, model: Model) -> Iterator[str]:
         if not (folder / name).is_file():
             yield f"{name} is missing"
         elif (folder / name).read_bytes() != text.encode("utf-8"):
-            yield f"{name} is not what the model says"
+            yield f"{name} differs from the model"
     if model.evidence is not None and model.evidence.reference is not None:
         yield from (
             f"{n} is missing"
@@ -89,7 +89,7 @@ def _of_record(
     present = {c.name for c in model.components}
     outside = model.evidence.outside if model.evidence else ()
     if missing := [n for n in outside if n not in present]:
-        remark = f"not compared: the FMU leaves out {', '.join(missing)}, with which it was found"
+        remark = f"not compared: the FMU leaves out {', '.join(missing)}, with which it was fitted"
         return CheckRow(name, 0.0, ERROR_LIMIT, True, remark)
     ready = prepared(record)[0] if run.averaged > 1 else as_read(record)
     if ready.n != run.samples:

@@ -97,7 +97,7 @@ def memory(fmu: Fmu) -> Findings:
         if time.monotonic() > end and count > _WARM:
             break
     if not before:
-        yield Remark("this system does not tell the memory of a process")
+        yield Remark("this system does not report the memory of a process")
         return
     leak = max(0.0, float(_resident() - before)) / max(1, count - _WARM)
     yield leak
@@ -165,13 +165,13 @@ def dependencies(fmu: Fmu) -> Findings:
         if e.dependencies is not None and e.variable.name in wanted
     }
     if fmu.description.modelExchange is None or not table:
-        yield Remark("none are told, or there is no model exchange to see them by")
+        yield Remark("none are declared, or there is no model exchange to check them by")
         return
     with _moved_point(fmu) as (instance, point):
         moved = {n: v + 0.1 * fmu.nominals[n] for n, v in point.items() if n != "time"}
         for name, known in movements(instance, point, list(table), moved, _ROUNDING):
             if table[name].isdisjoint((known, fmu.elements[known].variable)):
-                yield f"'{name}' depends on '{known}', which is not told"
+                yield f"'{name}' depends on '{known}', which is not declared"
 
 
 def _settable(fmu: Fmu) -> dict[str, float]:
@@ -199,7 +199,7 @@ def start_values(fmu: Fmu) -> Findings:
     if starts := _settable(fmu):
         with fmu.open(fmu.interfaces()[0]) as instance:
             instance.setup()
-            words = "'{0}' starts at {2:.6g}, its description says {1:.6g}"
+            words = "'{0}' starts at {2:.6g}, its description has {1:.6g}"
             yield from _other_values(instance, starts, words)
 
 

@@ -106,7 +106,7 @@ def variable_table(model: Model) -> tuple[Variable, ...]:
     if starts_at_voltage(model):
         voltage = next(v for v in table if v.kind == "input" and v.name == "voltage")
         meaning = (
-            "voltage at which it begins settled; at this value with the start values given here"
+            "voltage at which it starts settled; at this value with the start values stated here"
         )
         option = replace(
             voltage, name=START_VOLTAGE, kind="option", index=START_INDEX, description=meaning

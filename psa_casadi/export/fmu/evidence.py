@@ -46,7 +46,7 @@ def with_validity(model: Model) -> Model:
         return model
     if model.evidence is None or "drive" not in (c.name for c in model.components):
         raise InputError(
-            f"The model '{model.name}' does not say what its records have shown, so it has no"
+            f"The model '{model.name}' does not hold the ranges of its records, so it has no"
             f" output '{OUTPUT}'; give a file that `psa identify` or `psa diagnose` of this version"
             " wrote."
         )
@@ -92,12 +92,12 @@ RELATED: dict[str, Related] = {
     SETS: (SSV, "parameter", "values within their uncertainty: {set}"),
     START: (SSV, "parameter", "all parameters, and the states at the start of the run"),
     INPUTS: (CSV, "other", "inputs of {run}"),
-    OUTPUTS: (CSV, "result", "what the model says of {run}"),
+    OUTPUTS: (CSV, "result", "what the model predicts for {run}"),
     MEASURED: (CSV, "result", "what was measured in {run}, without the offset"),
     VALIDATION: (EXP, "experiment/validation", "{run}"),
     UNCERTAINTY: (
         EXP, "experiment/uncertainty-analysis",
-        "the same voltage with each parameter set, from the FMU's own start"),
+        "the same voltage with each parameter set, from the FMU's start"),
 }  # fmt: skip
 
 

@@ -109,7 +109,7 @@ def chosen_platforms(names: Sequence[str]) -> tuple[Platform, ...]:
         chosen.update({p.name: p for p in result})
     if {*names} != {"host"} and not has_zig():
         raise InputError(
-            f"The machine's own compiler makes binaries for systems like this one alone; for"
+            f"The machine's compiler makes binaries for systems like this one alone; for"
             f" {', '.join(chosen)} run `{INSTALL_ZIG}`, or export with --platforms host."
         )
     return tuple(chosen.values())

@@ -76,7 +76,7 @@ def _wrong_names(entries: list[zipfile.ZipInfo]) -> Iterator[str]:
     same = {(e.filename.removesuffix("/"), e.CRC, e.file_size) for e in entries}  # a repeat is none
     for place, count in Counter(name.casefold() for name, *_ in same).items():
         if count > 1:
-            yield f"{place[:80]!a} stands for {count} entries on some file systems"
+            yield f"{place[:80]!a} names {count} entries on some file systems"
 
 
 def _wrong_sizes(entries: list[zipfile.ZipInfo], packed: int) -> Iterator[str]:

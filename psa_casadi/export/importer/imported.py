@@ -146,7 +146,7 @@ class Imported:
             old.require("Reset")
         instance.setup(values={**dict(self.selected.fixed), **parameters})
         if instance.leave_event_mode() < math.inf:
-            raise TimeEventError("the FMU announces an event at a time of its own")
+            raise TimeEventError("the FMU announces a time event")
         return instance
 
     def _prepared(self, slot: int, place: int, p: "ctypes._Pointer[c_double]") -> int | None:

@@ -1,6 +1,6 @@
 """An FMU as a whole in the middle of a model: only what goes in and what comes out is known.
 
-    u -- effects of inputs --> applied u -- FMU(p) --> y -- effects of outputs --> shown y
+    u -- effects of inputs --> applied u -- FMU(p) --> y -- effects of outputs --> reported y
 
 Effects are CasADi's as everywhere, with exact derivatives. Those of the FMU by its parameters, and
 by those of effects at its inputs, are differences of whole runs, side by side in processes: one run
@@ -52,7 +52,7 @@ _PARTS: dict[str, int] = {}
 _KEPT, _LOOK = 512, 0.1
 #: Prefixes of names in a model without its FMU: the FMU's outputs, which are played to it as
 #: inputs, and the FMU's inputs, which are its outputs.
-PLAYED, GIVEN = "played_", "given_"
+PLAYED, SUPPLIED = "played_", "given_"
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Played:
         wanted = list(model.output_names if outputs is None else outputs)
         away, names = x0 - start_for(model, t, u, {}).x, inner.output_names
         states = dict(zip(model.state_names, away.tolist(), strict=True))
-        count, inputs = len(unknowns), [GIVEN + n for n in model.input_names]
+        count, inputs = len(unknowns), [SUPPLIED + n for n in model.input_names]
 
         def around(y: FloatArray, texts: Sequence[str], by: Sequence[str | int]) -> Steps:
             """Return a run of the effects alone, with outputs (n, ny) of the FMU."""
@@ -229,13 +229,13 @@ def _inner(component: Component) -> Component:
     opened = component.equations if isinstance(component.equations, Opened) else None
     inputs, outputs = component.inputs, component.outputs
     played = [Input(PLAYED + o.name, o.unit, o.description) for o in outputs]
-    given = [Output(GIVEN + i.name, i.unit, i.description) for i in inputs]
-    pairs = [*zip(outputs, played, strict=True), *zip(given, inputs, strict=True)]
+    supplied = [Output(SUPPLIED + i.name, i.unit, i.description) for i in inputs]
+    pairs = [*zip(outputs, played, strict=True), *zip(supplied, inputs, strict=True)]
     plain = replace(
         opened.component if opened else component,
         equations=Passed(tuple((o.name, i.name) for o, i in pairs)),
         inputs=(*inputs, *played),
-        outputs=(*outputs, *given),
+        outputs=(*outputs, *supplied),
         foreign=None,
         played=None,
     )
@@ -265,7 +265,7 @@ def _filtered(structure: Structure) -> bool:
 
 def _inputs_depend(structure: Structure, symbols: Expression) -> bool:
     """Whether inputs of an FMU depend on symbols."""
-    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(GIVEN)]
+    rows = [k for k, o in enumerate(structure.outputs) if o.name.startswith(SUPPLIED)]
     return bool(rows and symbols.numel() and ca.depends_on(structure.y[rows], symbols))
 
 

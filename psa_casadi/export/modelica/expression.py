@@ -81,7 +81,7 @@ def check_identifier(name: str, what: str) -> None:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) or name in RESERVED:
         raise InputError(
             f"'{name}' cannot name {what}; use letters, digits, underscores, no digit first, and"
-            " none of Modelica's own words."
+            " none of Modelica's reserved words."
         )
 
 

@@ -212,7 +212,7 @@ def _wrapped(record: Record) -> str:
     return (
         f"Record '{record.name}': the displacement jumps {np.count_nonzero(large)} times by"
         f" {scale * period:.4g} {unit}, up or down, and follows the voltage without these jumps:"
-        " the sensor, or its counter, begins again at the end of its range. Add the jumps up"
+        " the sensor, or its counter, restarts at the end of its range. Add the jumps up"
         f" (numpy.unwrap with period={scale * period:.4g}), or record with a larger range."
     )
 
@@ -401,7 +401,7 @@ def doubtful_voltage(records: Sequence[Record]) -> str:
         f"The voltage reaches {top:.5g} V, and no stack bears more than {_SPANS[1]:.0f} V: it"
         " probably is in millivolts, or holds the counts of a converter or an offset. Give it in"
         " volts, or its unit (--columns voltage=NAME:mV); what depends on the level of the voltage"
-        " cannot be told so."
+        " cannot be determined from these."
     )
 
 

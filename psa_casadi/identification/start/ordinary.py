@@ -56,7 +56,7 @@ def forms_of(model: Model, hysteresis: Hysteresis | None) -> tuple[Model, ...]:
     known = {c.name for c in FORMS.values()}
     if not any(c.name in known for c in model.components):
         raise InputError(
-            f"The model '{model.name}' has no hysteresis of its own to give another form; leave"
+            f"The model '{model.name}' has no hysteresis that could take another form; leave"
             " --hysteresis out."
         )
     models = []

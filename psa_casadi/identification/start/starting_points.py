@@ -594,7 +594,7 @@ def starting_points(
     where the records show a loop, and where they show dynamics to try. The model's loop where
     its hysteresis is none of Bouc-Wen's.
     """
-    shapes: list[tuple[str, dict[str, float]]] = [("the model's own loop", {})]
+    shapes: list[tuple[str, dict[str, float]]] = [("the model's loop", {})]
     if has_loop(model):
         shapes = [(f"loop shape {k}", shape) for k, shape in enumerate(loop_starts(model), 1)]
         loop = loop_start(model, records)

@@ -40,26 +40,26 @@ def monitor(s: Symbols) -> Equations:
 @component(
     Parameter("sensor_2_scale", 1.0, "1", (-1e6, 1e6), "second reading over displacement"),
     Output("displacement_2", "m", "displacement as the second sensor shows it", stroke_scale, "um"),
-    description="a second displacement sensor, straight, with a scale of its own",
+    description="a second displacement sensor, linear, with a separate scale",
     source="definition",
     belongs_to="sensor",
     equation_text="x_2 = sensor_2_scale x",
 )
 def second_sensor(s: Symbols) -> Equations:
-    """A second displacement sensor, straight, with a scale of its own."""
+    """A second displacement sensor, linear, with a separate scale."""
     return Equations(out={"displacement_2": s.sensor_2_scale * s.displacement})
 
 
 @component(
     Parameter("strain_scale", 50.0, "1/m", (-1e9, 1e9), "strain per displacement", scale=50.0),
     Output("strain", "1", "strain that the gauge shows", _strained),
-    description="a strain gauge on the stack, straight, with a scale of its own",
+    description="a strain gauge on the stack, linear, with a separate scale",
     source="definition",
     belongs_to="sensor",
     equation_text="strain = strain_scale x",
 )
 def strain_gauge(s: Symbols) -> Equations:
-    """A strain gauge on the stack, straight, with a scale of its own."""
+    """A strain gauge on the stack, linear, with a separate scale."""
     return Equations(out={"strain": s.strain_scale * s.displacement})
 
 
@@ -111,7 +111,7 @@ def _component(name: str, *, temperature: bool) -> Component:
     meaning = _MEANING.format(", temperature" if temperature else "")
     return Component(
         name=name,
-        description="tells how far a run has left what the records behind the model have shown",
+        description="distance of a run from the ranges of the model's records",
         source="definition; the ranges are those of the records",
         equations=partial(_validity, temperature=temperature),
         equation_text=_TEXT.format(" + beyond(T)" if temperature else ""),

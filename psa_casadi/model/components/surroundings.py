@@ -4,7 +4,7 @@ Both amplifiers have a limit of the current into their load, as one of the outpu
 The compensator's observer runs eq. (8) on the voltage that it commands itself, as eq. (37) does:
 what leaves it is v - f_H_hat / (k_L G), and f_H_hat' follows from the voltage that this puts on the
 electrodes, behind the lag T_d of amplifier, output resistance and capacitance. Both u_hat and
-f_H_hat are states, so there is no algebraic loop. With the stack's own parameters the generated
+f_H_hat are states, so there is no algebraic loop. With the stack's parameters the generated
 force is k_L G v after the lag, without hysteresis.
 """
 
@@ -354,7 +354,7 @@ def _command_scale(p: Values) -> float:
     source="Yang and Zhu 2015, section 5.1: observer (37), compensation (39) to (41)",
     equation_text=(
         "v_c = v - compensation f_H_hat / (k_L G);  T_d u_hat' + u_hat = G v_c;"
-        "  f_H_hat from u_hat by the stack's own equation (8)"
+        "  f_H_hat from u_hat by the stack's equation (8)"
     ),
     belongs_to="drive",
     needs=("linear_force", "bouc_wen"),

@@ -151,7 +151,7 @@ def drive_lag(s: Symbols) -> Equations:
     needs_column=("monitor_voltage",),
     probe={"amplifier_angle": ANGLES},
     remedy=Remedy("measure_voltage", "range"),
-    looks_like="the voltage at the stack is a bent curve over the command, on both branches alike",
+    looks_like="the voltage at the stack over the command is one bent curve for both branches",
 )
 def amplifier_nonlinearity(s: Symbols) -> Equations:
     """Amplifier nonlinearity: the amplifier's gain changes with its output.

@@ -64,7 +64,7 @@ def _part(name: str) -> State:
     tone="hum_frequency",
     equation_text=(
         "x_m gains hum_gain (a cos(w t) + b sin(w t)),  w = 2 pi hum_frequency,"
-        "  a' = b' = 0 with a start of each record's own"
+        "  a' = b' = 0 with a separate start for each record"
     ),
     probe={"hum_frequency": SPECTRAL_PEAKS},
     remedy=Remedy("shield", "record"),
@@ -74,8 +74,8 @@ def _part(name: str) -> State:
 def mains_hum(s: Symbols) -> Equations:
     """Mains hum: a line at one frequency in the reading, whatever the drive does.
 
-    The hum is an undamped oscillator w1' = w w2, w2' = -w w1 whose amplitude and phase are each
-    record's own. It is written in the frame that turns with it: w1 = a cos(w t) + b sin(w t) with
+    The hum is an undamped oscillator w1' = w w2, w2' = -w w1 whose amplitude and phase are
+    separate for each record. In the frame that turns with it w1 = a cos(w t) + b sin(w t) with
     a' = b' = 0, the exact solution. So it costs no steps, keeps its amplitude for any number of
     periods, and a line above the sampling rate shows up at its alias. a and b are memories that
     rest at any value; at the start (0, 0) there is no hum. The gain has either sign, so that one

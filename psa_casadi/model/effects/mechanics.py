@@ -158,7 +158,7 @@ _MOST = 0.5
 def load_stiffness(s: Symbols) -> Equations:
     """Load stiffness: an elastic load or guide whose stiffness changes with displacement.
 
-    A linear load is no effect of its own: it stiffens k_B (or k) and, for the same stroke per volt,
+    A linear load is no separate effect: it stiffens k_B (or k) and, for the same stroke per volt,
     scales k_L, so that by voltage and displacement a stack with a spring is indistinguishable from
     a stiffer one. Only a factor that depends on displacement shows: contacts and disc springs bow
     the curve, flexures that stretch bend it at the end (Duffing's cubic force 20 sin(a) gain q^3 is
@@ -180,7 +180,7 @@ _CONTACT_WIDTH = 5e-3
     share(
         "contact_position",
         (-0.5, 1.5),
-        "displacement at which contact begins, over the stroke",
+        "displacement of first contact, over the stroke",
         0.1,
         0.4,
     ),

@@ -105,8 +105,8 @@ def sensor_lag(s: Symbols) -> Equations:
 def sensor_nonlinearity(s: Symbols) -> Equations:
     """Sensor nonlinearity: the reading is a bent function of the displacement.
 
-    A constant and a slope are the sensor's offset and its sensitivity, which a fit takes for the
-    stack's own; what remains of a smooth curve is a bow, an S and a W.
+    A constant and a slope are the sensor's offset and its sensitivity, which a fit
+    attributes to the stack; what remains of a smooth curve is a bow, an S and a W.
     """
     full = stroke(s)
     curve = shapes.bend(s.displacement / full, s.nonlinearity_angle, s.nonlinearity_wave)

@@ -161,12 +161,12 @@ class Chosen:
     def _refuse_absent(self, name: str, source: Source, present: str) -> None:
         self.problems.add(
             f"{self.table.where}: '{source.array}', which --columns names for '{name}', is"
-            f" not in the header (found: {present}); correct --columns."
+            f" not in the header (present: {present}); correct --columns."
         )
 
     def _refuse_second(self, name: str, index: int, first: Field) -> None:
         self.problems.add(
-            f"{self.table.where}, column {index + 1}: '{name}' stands twice in the header (first"
+            f"{self.table.where}, column {index + 1}: '{name}' occurs twice in the header (first"
             f" as column {first.index + 1}); rename or remove one of the two."
         )
 
@@ -181,7 +181,7 @@ class Chosen:
         self.open = [Question(text, ASK_UNIT, f"write a first line such as '{example}'")]
 
     def _ask_column(self, name: str, present: str, cure: str) -> None:
-        what = f"{self.table.where}: the column '{name}' is missing (found: {present})"
+        what = f"{self.table.where}: the column '{name}' is missing (present: {present})"
         self.open.append(Question(what, ASK_COLUMN, "" if self.table.sizes else cure))
 
 

@@ -56,7 +56,7 @@ def ready_line(sources: ColumnMap, sample_time: float | None = None, table: str 
     options += [f"--sample-time {sample_time:g}"] if sample_time is not None else []
     yours = ["your units"] if sources else []
     yours += ["your time between samples [s]"] if sample_time is not None else []
-    scale = "; ':10um' says that 1 in the file is 10 um"
+    scale = "; ':10um' means that 1 in the file is 10 um"
     scale = scale if any(source.scale is not None for source in sources.values()) else ""
     return f"{' '.join(options)} (with {' and '.join(yours)}{scale})" if yours else options[0]
 
@@ -162,7 +162,7 @@ def parse_columns(text: str, names: Collection[str] = ()) -> ColumnMap:
             meant = f"is '{near[0]}' meant? There are" if near else "there are"
             problems.add(f"{where}: '{name}' is no column of a record; {meant} {', '.join(known)}.")
         elif key in sources:
-            problems.add(f"{where}: '{key}' is given twice; remove one of the two.")
+            problems.add(f"{where}: '{key}' is specified twice; remove one of the two.")
         else:
             scaled = _SCALED.fullmatch(unit.strip()) if unit else None
             scale = float(scaled["scale"]) if scaled else None

@@ -68,7 +68,7 @@ def joined(
     channels, resampled = [], []
     for (path, _, _, item), time in zip(held, clocks, strict=True):
         if alone and len(item) != 1:
-            raise InputError(f"{path}: holds {len(item)} channels beside the time, expected one.")
+            raise InputError(f"{path}: holds {len(item)} channels besides the time, expected one.")
         channels += [(path, name, unit, time, values) for name, unit, values in item]
     first = clocks[0]
     shared = (first >= max(t[0] for t in clocks)) & (first <= min(t[-1] for t in clocks))

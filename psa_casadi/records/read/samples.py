@@ -189,7 +189,7 @@ class _Try:
         table, request = self.table, self.request
         step = request.sample_time
         if step is not None and fields.pop("time", None) is not None:
-            note = "the times of the file are left out for the sample time that was given."
+            note = "the times of the file are left out for the specified sample time."
             self.notes.append(note)
         columns = table.load([f.index for f in fields.values()], None, self.problems)
         if self._lengths_differ(fields, columns):
@@ -224,8 +224,8 @@ class _Try:
             raise InputError(f"{self.table.path}: {problem}")
         if step != self.table.step:
             self.notes.append(
-                f"{step:g} s from sample to sample is what was given; if it is invented, as for a"
-                " curve without time, rates, creep and lags mean nothing."
+                f"{step:g} s from sample to sample is the specified sample time; if it is invented,"
+                " as for a curve without time, rates, creep and lags mean nothing."
             )
         return self._located("time", step * np.arange(len(lines), dtype=np.float64), lines)
 
@@ -289,7 +289,7 @@ class _Try:
                 self.outcome.tables = tuple(keys)
                 if not self.open:  # an open question of the whole table comes first
                     self.problems.add(
-                        f"{table.path}: the time begins anew {len(keys) - 1} times, so it holds"
+                        f"{table.path}: the time restarts {len(keys) - 1} times, so it holds"
                         f" {len(keys)} records: {listed}; take one of them, such as"
                         f" {ready_line({}, None, keys[0])}, or each as a record:"
                         f" {ready_line({}, None, ALL)}."
@@ -300,8 +300,8 @@ class _Try:
         elif len(starts) > 2 and len(set(sizes[:-1].tolist())) == 1 and np.isfinite(time).all():
             if np.array_equal(time[: sizes[0]], time[sizes[0] : 2 * sizes[0]]):
                 text = (
-                    f"{table.path}: the time begins anew every {sizes[0]} {table.place}s: these"
-                    " packets have no time of their own"
+                    f"{table.path}: the time restarts every {sizes[0]} {table.place}s: these"
+                    " packets have no separate times"
                 )
                 self.open.append(Question(text, ASK_UNIT))
                 return None

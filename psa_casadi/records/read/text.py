@@ -424,7 +424,7 @@ def decoded(data: bytes, path: str) -> str:
             return data.decode("utf-16")
         except UnicodeDecodeError:
             raise InputError(
-                f"{path}: begins as UTF-16 text and is none; save it as 'CSV UTF-8'."
+                f"{path}: starts as UTF-16 text and is none; save it as 'CSV UTF-8'."
             ) from None
     for first, coding in ((1, "utf-16-le"), (0, "utf-16-be")):  # Windows' text without a mark
         if data[first : first + 3 : 2] == b"\0\0" and len(data) % 2 == 0:
@@ -546,7 +546,7 @@ def _labview(path: str, lines: Sequence[str]) -> Sequence[str]:
         if header and names != header:
             raise InputError(
                 f"{path}: line {end + 2}: this part has other columns than the one before; save"
-                " each part as a file of its own."
+                " each part as a separate file."
             )
         if not header:
             rows[end + 1] = header = names

@@ -30,7 +30,7 @@ from psa_casadi.report.words import colours
 from psa_casadi.report.words.phrases import added, handy_scale, in_brackets, length_scale, plain
 from psa_casadi.report.words.series import Curve, Series, spans
 from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
-from psa_casadi.simulation.exact.run import ALIKE
+from psa_casadi.simulation.exact.run import EQUAL_STEPS
 from psa_casadi.simulation.simulate import input_samples, output_of
 from psa_casadi.simulation.start import is_stack
 from psa_casadi.simulation.stepper import run
@@ -141,7 +141,7 @@ def live_diagnosis(d: StackDiagnosis | Diagnosis, rows: Sequence[Series]) -> Liv
         share = d.noise_floor_rms_m / (float(np.sqrt(np.mean([s.noise**2 for s in rows]))) or 1.0)
         if d.patch is not None:
             beyond = [p - x for p, x in zip(d.patch.predicted, d.extended, strict=True)]
-            text = f"{d.patch.name}, as it was found: it does not follow"
+            text = f"{d.patch.name}, as it was fitted: it does not follow"
     records = _fitted_records(d, d.extended_fit, rows, beyond, share)
     return LiveModel(d.model, module, records, extended=added(d), correction=text)
 
@@ -228,7 +228,7 @@ def _record(r: LiveRecord, limit: int, design: bool) -> dict[str, Any]:
     t = s.time[part] - s.time[0]
     residual = r.residual[part]
     fitted = np.isfinite(residual) & ~s.held_out[part]
-    even = len(t) > 2 and float(np.ptp(np.diff(t))) <= ALIKE * float(t[1])
+    even = len(t) > 2 and float(np.ptp(np.diff(t))) <= EQUAL_STEPS * float(t[1])
     return {
         "name": s.name,
         "note": note,

@@ -207,7 +207,7 @@ def write_posterior(posterior: Posterior, path: str | os.PathLike[str]) -> None:
     """
     name = plain(posterior.model.name)
     records = phrases.counted(len(posterior.task.experiments), "record")
-    verdict = f"The posterior of {name}, given {records}: {text.drawn(posterior)}."
+    verdict = f"The posterior of {name}, from {records}: {text.drawn(posterior)}."
     options = {"posterior": posterior, "verdict": verdict, "figure": posterior_figure(posterior)}
     atomic_write(path, render("posterior.html", f"Posterior of {name}", [records], **options))
 

@@ -164,7 +164,7 @@ def _over_devices(
     sides = np.where(np.arange(order.size) < 0.5 * order.size, "middle right", "middle left")
     for name, which, colour, symbol in (
         ("belongs to the others", ~far, colours.EXTENDED, "circle"),
-        ("stands out", far, colours.BASE, "diamond"),
+        ("outlier", far, colours.BASE, "diamond"),
     ):
         if not which.any():
             continue

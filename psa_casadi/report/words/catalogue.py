@@ -56,7 +56,7 @@ def _word(code: str, table: str, other: str | None = None) -> Any:
 
 
 def plural(count: Any, one: str, several: str) -> str:
-    """Return the word for a number of things, or for so many as there are."""
+    """Return the singular or plural for a number, or for the length of a collection."""
     return one if (len(count) if hasattr(count, "__len__") else count) == 1 else several
 
 

@@ -191,7 +191,7 @@ def effect_size(effect: Component, model: Model, sizes: Sequence[Size]) -> str:
     name = effect.gain or ""
     unit, (value,) = in_display_unit(model, name, model.values[name])
     gain = with_unit(number(value, 2), unit)
-    size = size_text(sizes, handy_scale) or "it changes too little to be seen in its test"
+    size = size_text(sizes, handy_scale) or "its change is too small to observe in its test"
     stack = next((n for n in STACKS if re.sub(r"\W", "_", n) == model.name), "this model")
     return f"on {stack} with {name} = {gain}: {size}"
 

@@ -35,7 +35,7 @@ LANES = 4
 MOST, AT, MOST_IN_LANES = 60, 1e-6, 100_000
 #: Time steps that differ by less than this share count as one, and LENGTHS of them may differ by
 #: more.
-ALIKE, LENGTHS = 1e-6, 8
+EQUAL_STEPS, LENGTHS = 1e-6, 8
 #: Vectors of four numbers whatever the processor; strict C99 has no vectors.
 _FLAGS = ("-std=gnu99", "-fno-math-errno")
 #: With -O1 a model compiles in 0.5 s, with -O3 in 1.2 s, and runs as fast within 10 %. Many sets
@@ -137,11 +137,11 @@ def time_steps(t: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32]]:
     """
     steps = np.diff(t)
     mean = float(steps.mean())
-    if float(np.abs(steps - mean).max()) <= ALIKE * mean:
+    if float(np.abs(steps - mean).max()) <= EQUAL_STEPS * mean:
         return np.array([mean]), np.zeros(steps.size, np.int32)
     order = np.argsort(steps, kind="stable")
     sizes = steps[order]
-    starts = np.concatenate([[True], np.diff(sizes) > ALIKE * sizes[1:]])
+    starts = np.concatenate([[True], np.diff(sizes) > EQUAL_STEPS * sizes[1:]])
     groups = np.cumsum(starts) - 1
     count = int(groups[-1]) + 1
     if count > LENGTHS:

@@ -236,7 +236,7 @@ def _split(s: Structure) -> Split:
     rates = [s.xdot[g.driver] for g in groups]
     for name, expression in s.switches.items():
         if not any(ca.is_equal(expression, rate, 20) for rate in rates):
-            raise NoSplit(f"its equations have a kink of their own ({name})")
+            raise NoSplit(f"its equations have another kink ({name})")
     return Split(s, linear, groups, ports, order_of(s, groups, ports, reach), matrices)
 
 
