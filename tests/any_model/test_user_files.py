@@ -409,7 +409,7 @@ def test_words_and_records_that_cannot_be_meant_are_refused() -> None:
         psa.identify("record.csv", known_start=True)  # type: ignore[call-overload]
     with pytest.raises(psa.InputError, match=r"`leave_out` has 'slow_crep', which is no effect"):
         psa.diagnose("record.csv", leave_out=["slow_crep"])
-    with pytest.raises(psa.InputError, match=r"no effect; of the \d+ there are.* are lag"):
+    with pytest.raises(psa.InputError, match=r"name starts; of the \d+ there are.* are lag"):
         psa.diagnose(motor(), record, leave_out=["lagg"], starts=1)
 
 

@@ -154,7 +154,7 @@ def test_the_command_states_which_input_may_move(tmp_path: Path) -> None:
     words = ("design", "experiment", "--model", tmp_path / "m.json", "--duration", "600")
     assert "add --input NAME=LOW:HIGH, of q, r." in refused(*words)
     output = refused(*words, "--input", "q=1", "--low", "3", "--noise", "-1")
-    for part in ("--input is 'q=1'", "--low is not there for a model", "--noise is -1"):
+    for part in ("--input is 'q=1'", "--low does not apply to your model", "--noise is -1"):
         assert part in output
     output = refused("design", "experiment", "--stack", "demo", "--duration", "1", "--known-start")
     assert "--known-start applies to your model" in output
