@@ -103,7 +103,7 @@ def table(path: Path) -> dict[str, Floats]:
     columns = zip(*(row.split(",") for row in rows), strict=True)
     return {
         name: np.array([float(x) if x else np.nan for x in column])
-        for name, column in zip(head.split(","), columns, strict=True)
+        for name, column in zip(head.replace('"', "").split(","), columns, strict=True)
     }
 
 
