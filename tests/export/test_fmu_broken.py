@@ -140,6 +140,8 @@ WRONG = [(fault, fmi) for k, fault in enumerate(DESCRIPTIONS) for fmi in VERSION
 harmless = pytest.mark.usefixtures("code_runs_here")
 #: Any change of description or sources fails this row too.
 ALWAYS = "reproducible"
+#: More indicators than there are cannot be read; of fewer, as of FMI 3, the solver asks for none.
+BESIDES = {("wrong number of event indicators", 2): {"model exchange"}}
 
 
 def _failures(report: psa.CheckReport) -> dict[str, str]:
@@ -176,7 +178,7 @@ def test_wrong_description(fault: str, fmi: int, tmp_path: Path) -> None:
     edit, rows, remark = DESCRIPTIONS[fault]
     changes = {XML: _edit(*edit(fmi))}
     result = _failures(psa.check_fmu(rewritten(exported(STACK, fmi), tmp_path / "b.fmu", changes)))
-    assert set(result) == rows | {ALWAYS}, result
+    assert set(result) == rows | {ALWAYS} | BESIDES.get((fault, fmi), set()), result
     assert any(remark in result[row] for row in rows), result
 
 
@@ -262,7 +264,7 @@ MISSING = {
 @harmless
 def test_wrong_face_of_fmi_3(tmp_path: Path) -> None:
     result = _failures(psa.check_fmu(recompiled(tmp_path / "b.fmu", 3, FACE)))
-    rows = {"adjoint derivatives", "life cycle", "event indicators", "model exchange"}
+    rows = {"adjoint derivatives", "life cycle", "event indicators", "model exchange", "snapshots"}
     assert rows == set(result), result
     assert "stays negative after an event" in result["event indicators"]
 

@@ -329,7 +329,7 @@ def test_intervals_hold_the_truth_and_agree_with_standard_errors(tmp_path: Path)
     result.report(tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text("utf-8"))
     assert (
-        "The posterior of motor, given 2 records: 2 chains of 250 draws, 0 divergent." in page.text
+        "The posterior of motor, from 2 records: 2 chains of 250 draws, 0 divergent." in page.text
     )
     assert "run_2 w" in page.text
     assert page.loaded == []

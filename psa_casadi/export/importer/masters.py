@@ -5,7 +5,7 @@ CVode, asks for rates.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -112,13 +112,38 @@ def co_simulate(
 
 
 class _Solver(CVodeSolver):  # type: ignore[misc]
-    """fmpy's CVode, with the inputs of the time at which it asks for rates."""
+    """fmpy's CVode, with the inputs at the time of the rates, and the errors of the FMU."""
+
+    _problem: FmuError | None = None
 
     def f(self, t: float, y: Any, ydot: Any, data: Any) -> int:
         """Set the inputs, then compute the rates: fmpy's has those of the step's beginning."""
+        return self._answered(lambda: self._rates(t, y, ydot, data))
+
+    def _rates(self, t: float, y: Any, ydot: Any, data: Any) -> None:
         self.set_time(t)
         self.input.apply(t)
-        return int(super().f(t, y, ydot, data))
+        super().f(t, y, ydot, data)
+
+    def g(self, t: float, y: Any, gout: Any, data: Any) -> int:
+        """Compute the event indicators."""
+        return self._answered(lambda: CVodeSolver.g(self, t, y, gout, data))
+
+    def _answered(self, call: Callable[[], object]) -> int:
+        """Return 0, or -1 after an error, which ctypes would only print."""
+        try:
+            call()
+        except FmuError as error:
+            self._problem = error
+            return -1
+        return 0
+
+    def step(self, t: float, tNext: float) -> Any:
+        """Take a step; raises the error of the FMU that ended it."""
+        try:
+            return super().step(t, tNext)
+        except Exception as error:
+            raise self._problem or error from error
 
 
 def integrate(
