@@ -344,7 +344,8 @@ def test_states_are_numbers_without_pointers_and_others_are_refused(slave: Insta
     broken = [
         (data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :], reason) for k, reason in flips.items()
     ]
-    for wrong, reason in [*broken, (data[:-1], "no snapshot of this model"), (data + b"\0", "")]:
+    broken += [(other, "no snapshot of this model") for other in (data[:-1], data + b"\0")]
+    for wrong, reason in broken:
         with pytest.raises(FmuError, match=reason) as refusal:
             restore(slave, wrong)
         assert refusal.value.status == ERROR
