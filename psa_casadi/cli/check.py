@@ -81,7 +81,7 @@ def check(
     judge("check", fmu.name, check_cases(report), junit, began)
 
 
-def check_cases(report: psa.CheckReport) -> list[Case]:
+def check_cases(report: "psa.CheckReport") -> list[Case]:
     """Return every check of an FMU as a test."""
     from psa_casadi.report.words.tables import check_table
 

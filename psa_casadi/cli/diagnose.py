@@ -146,7 +146,7 @@ _Paths = tuple[Sequence[Path], Sequence[Path], Sequence[Path]]
 def _of_stack(
     inputs: Inputs, reading: Reading, paths: _Paths, start: tuple[Path | None, str | None],
     form: tuple[float | None, Hysteresis], left_out: Sequence[str],
-) -> Callable[..., psa.Diagnosis]:  # fmt: skip
+) -> "Callable[..., psa.Diagnosis]":  # fmt: skip
     """Read the records of a stack; return a function of `progress` and `watch` that diagnoses them.
 
     `start` is the model or the stack that the fits start from, `form` stiffness and hysteresis.
@@ -166,9 +166,9 @@ def _of_stack(
 
 
 def _of_any(
-    inputs: Inputs, reading: Reading, paths: _Paths, model: psa.Model, fitting: Fitting,
+    inputs: Inputs, reading: Reading, paths: _Paths, model: "psa.Model", fitting: Fitting,
     left_out: Sequence[str], others: Mapping[str, object],
-) -> Callable[..., psa.Diagnosis]:  # fmt: skip
+) -> "Callable[..., psa.Diagnosis]":  # fmt: skip
     """Read the records of a model that is no stack; return a function as `_of_stack` does.
 
     `others` are options that must be empty.
@@ -182,12 +182,12 @@ def _of_any(
 
 
 def _finish(
-    d: psa.Diagnosis,
+    d: "psa.Diagnosis",
     following: Path | None,
     outputs: Mapping[str, Path | None],
     page: tuple[str, bool],
     progress: Callable[[str], None],
-) -> tuple[psa.Diagnosis, str]:
+) -> "tuple[psa.Diagnosis, str]":
     """Design what follows and write all files; return the diagnosis and why a patch is missing.
 
     `page` is the origin of the records, and whether the page is still.
@@ -229,7 +229,7 @@ def _searched(inputs: Inputs, left_out: Sequence[str]) -> "tuple[psa.Component, 
     return tuple(c for n, c in known.items() if n not in left_out)
 
 
-def _show_files(d: psa.Diagnosis, outputs: Mapping[str, Path | None], unpatched: str) -> None:
+def _show_files(d: "psa.Diagnosis", outputs: Mapping[str, Path | None], unpatched: str) -> None:
     """Name the files that were written, and say why a patch is missing."""
     from psa_casadi.cli import diagnosis_files as files
 

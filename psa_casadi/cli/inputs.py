@@ -55,7 +55,7 @@ class Inputs:
         self.user_effects = [c for result in read for c in (result or {}).values()]
         self._misfits = misfits(self.user_effects)
 
-    def effects_of_any_model(self) -> list[psa.Component]:
+    def effects_of_any_model(self) -> "list[psa.Component]":
         """Return the user's effects for a model that is no stack, which they need not fit."""
         self._misfits = []
         return self.user_effects
@@ -368,7 +368,7 @@ class Fitting:
 
 def own_model(
     inputs: Inputs, path: Path | None, fitting: Fitting, *, fitted: bool = True
-) -> psa.Model | None:
+) -> "psa.Model | None":
     """Return the model that a path names where it is no stack's; None for a stack's or none.
 
     Unless it is to be `fitted`, no parameter of an FMU is free.
@@ -391,7 +391,7 @@ def own_model(
     return model
 
 
-def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> "psa.Model | None":
     from psa_casadi.simulation.start import is_stack
 
     if (model := from_python(path)) is not None:
@@ -405,7 +405,7 @@ def _model(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Mo
     return None if is_stack(model) else model
 
 
-def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa.Model | None:
+def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> "psa.Model | None":
     """Return the model of an FMU, in whose names the parameters are that a fit is to find."""
     form, texts = "NAME=LOW:HIGH, such as --free mass=0.1:10", fitting.free or []
     bounds = inputs.named("--free", [t for t in texts if "=" in t], form, (2,))
@@ -415,7 +415,7 @@ def _imported(inputs: Inputs, path: Path, fitting: Fitting, fitted: bool) -> psa
     return psa.fmu_model(path, free=(free or None) if fitted else {}, values=values)
 
 
-def from_python(path: Path) -> psa.Model | None:
+def from_python(path: Path) -> "psa.Model | None":
     """Return the model of FILE.py:FUNCTION, of a function or a variable; None for other paths."""
     match = _PYTHON.fullmatch(str(path))
     if match is None:

@@ -2,9 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, Literal
 
 import psa_casadi as psa
 from psa_casadi.cli.inputs import Fitting, Inputs, own_model
@@ -12,7 +10,9 @@ from psa_casadi.cli.options import Reading, StackName, Start
 from psa_casadi.cli.screen import show, show_written, working
 from psa_casadi.common.display import with_units
 from psa_casadi.common.errors import Problems
-from psa_casadi.common.units import FloatArray, convert
+
+if TYPE_CHECKING:
+    from psa_casadi.common.units import FloatArray
 
 
 def simulate(
@@ -71,6 +71,8 @@ def simulate(
         if isinstance(record, psa.Record):
             outputs, report = _of_a_stack(chosen, applied, record, turns, begin, starts, hold)
         else:
+            import numpy as np
+
             u = np.column_stack([np.empty((record.n, 0)), *applied.values()])
             x0 = np.array([q.start for q in chosen.structure.states])
             y = psa.run(chosen, record.time - record.time[0], u, x0, hold=hold).y
@@ -145,7 +147,7 @@ def _of_a_stack(
     begin: Start,
     starts: dict[str, float],
     hold: str,
-) -> tuple[dict[str, FloatArray], tuple[str, str]]:
+) -> "tuple[dict[str, FloatArray], tuple[str, str]]":
     """Return the outputs of a stack, and texts on its start and its steps."""
     as_exported = begin.start_voltage is not None or (begin.history is None and model.starts_itself)
     first, memory = float(record.voltage[0]), None
@@ -160,9 +162,11 @@ def _of_a_stack(
 
 
 def _as_displayed(
-    model: "psa.Model", time: FloatArray, columns: dict[str, FloatArray]
+    model: "psa.Model", time: "FloatArray", columns: "dict[str, FloatArray]"
 ) -> "psa.Signals":
     """Return inputs and outputs in the units that they are displayed in."""
+    from psa_casadi.common.units import convert
+
     every: list[psa.Input | psa.Output] = [*model.structure.inputs, *model.structure.outputs]
     there = [v for v in every if v.name in columns]
     units = {v.name: v.display_unit or v.unit for v in there}
