@@ -209,6 +209,6 @@ def study(known: tuple[str, ...], foreign: tuple[str, ...], seeds: int, first: i
     cases += drawn("poor", POOR, 4 * seeds) + drawn("design", DESIGNS, 6 * seeds)
     for k in range(3 * seeds):
         cases.append(Case("ringing", None, next(seed), excitation=RINGING[k % len(RINGING)]))
-    cases += [several("three", 3) for _ in range(2 * seeds)]
+    cases += [several("three", 3) for _ in range(4 * seeds)]
     six = drawn("six", ["rich"], 3 * seeds)
     return cases + [replace(case, records=6) for case in six]

@@ -83,7 +83,12 @@ def identify(progress: Progress, quick: bool) -> Outcome:
     Both start at the same point near the truth (from farther away the peer stays in a side valley),
     search the same parameters with the same residuals, and stop when they will.
     """
-    return Outcome([_compared_with_scipy(2000 if quick else 20_000, progress)])
+    tables = [_compared_with_scipy(2000 if quick else 20_000, progress)]
+    if find_spec("jax_sysid"):
+        tables.append(_compared_with_jax_sysid(500 if quick else 2000, progress))
+    else:
+        progress("jax-sysid is not installed: `pip install --group jax-sysid` adds its table")
+    return Outcome(tables)
 
 
 def _record(samples: int) -> psa.Record:
@@ -173,8 +178,87 @@ def _scipy(record: psa.Record, sigma: float) -> Trace:
 
     ratio = np.array([_WRONG.get(n, 1.0) for n in FREE])
     z0 = np.append(np.where(positive, np.log(ratio), ratio), 0.0)
-    least_squares(residual, z0, method="lm", diff_step=np.full(z0.size, 1e-3), ftol=1e-5, xtol=1e-6)
+    step: Any = 1e-3  # MINPACK takes a number alone
+    least_squares(residual, z0, method="lm", diff_step=step, ftol=1e-5, xtol=1e-6)
     return trace
+
+
+#: A spring that hardens, over its mass: gain, damping, stiffness, cubic stiffness; a guess of each.
+_SPRING = {"b": 2.0, "d": 0.6, "k": 40.0, "c": 3000.0}
+_GUESS = {"b": 1.5, "d": 0.8, "k": 30.0, "c": 4000.0}
+
+
+def _spring(p: Sequence[Any], x: Any, force: Any) -> list[Any]:
+    """Return the rates of deflection [m] and speed under a force [N]."""
+    b, d, k, c = p
+    return [x[1], b * force - d * x[1] - k * x[0] - c * x[0] ** 3]
+
+
+def _by_identify(t: FloatArray, force: FloatArray, y: FloatArray) -> Mapping[str, float]:
+    x, u, p = ca.SX.sym("x", 2), ca.SX.sym("force"), ca.SX.sym("p", len(_SPRING))
+    rates = _spring(ca.vertsplit(p), x, u)
+    model = psa.ode_model(
+        {"x": x, "u": u, "p": p, "y": x[0], "ode": ca.vertcat(*rates)},
+        name="spring",
+        states=[psa.State("x", "m", "deflection"), psa.State("v", "m/s", "speed")],
+        outputs=[psa.Output("y", "m", "deflection")],
+        inputs=[psa.Input("force", "N", "force")],
+        parameters=[
+            psa.Parameter(n, v, "1", (v / 100.0, v * 100.0), n, log=True) for n, v in _GUESS.items()
+        ],
+    )
+    return psa.identify(model, {"time": t, "force": force, "y": y}).model.values
+
+
+def _by_jax_sysid(t: FloatArray, force: FloatArray, y: FloatArray) -> Mapping[str, float]:
+    """Fit as its documentation does: Adam, then L-BFGS; Heun's method, a step a sample."""
+    jax: Any = import_module("jax")
+    models: Any = import_module("jax_sysid.models")
+    heun: Any = import_module("diffrax").Heun
+    jax.config.update("jax_enable_x64", True)
+    jnp, guess, size = jax.numpy, list(_GUESS.values()), float(np.var(y))
+
+    def rates(x: Any, u: Any, now: Any, log_p: Any) -> Any:
+        return jnp.stack(
+            _spring([g * jnp.exp(q) for g, q in zip(guess, log_p, strict=True)], x, u[0])
+        )
+
+    model = models.CTModel(2, 1, 1, state_fcn=rates, output_fcn=lambda x, *_: x[:1])
+    model.init(params=[np.zeros(())] * len(guess), x0=np.zeros(2))
+    model.integration_options("linear", heun(), dt0=float(t[1]), max_steps=10 * len(t))
+    model.loss(lambda own, measured: jnp.sum((own - measured) ** 2) / size, rho_x0=0.0, rho_th=0.0)
+    model.optimization(adam_eta=0.01, adam_epochs=500, lbfgs_epochs=500, iprint=-1)
+    model.fit(y[:, None], force[:, None], t)
+    return {n: g * math.exp(q) for (n, g), q in zip(_GUESS.items(), model.params, strict=True)}
+
+
+def _compared_with_jax_sysid(samples: int, progress: Progress) -> TitledTable:
+    """Fit the spring to a record with 1 % of noise that LSODA simulates."""
+    progress(f"jax-sysid on {samples} samples (a minute)")
+    t = time_grid(samples * 5e-3, 5e-3)[:samples]
+    force, true = multisine(t, -3.0, 3.0, (0.2, 4.0), seed=1), list(_SPRING.values())
+    clean = solve_ivp(
+        lambda now, x: _spring(true, x, np.interp(now, t, force)), (0.0, t[-1]), [0.0, 0.0],
+        "LSODA", t, rtol=1e-9, atol=1e-12, max_step=5e-3,
+    ).y[0]  # fmt: skip
+    noise = np.random.default_rng(1).standard_normal(samples)
+    y, rows = clean + 0.01 * np.ptp(clean) * noise, []
+    for way, fit in (("psa.identify", _by_identify), ("jax-sysid, CTModel", _by_jax_sysid)):
+        spent = []
+        for _ in range(2):
+            begin = time.process_time()
+            fitted = fit(t, force, y)
+            spent.append(time.process_time() - begin)
+        rows.append({
+            "way": way, "CPU time [s], first": number(spent[0]), "again": number(spent[1]),
+            **{f"{n} off": f"{100 * (fitted[n] / v - 1):+.2f} %" for n, v in _SPRING.items()},
+        })  # fmt: skip
+    return TitledTable(
+        f"One fit of four parameters of a hardening spring to {samples} samples, 1 % of noise",
+        rows,
+        "jax-sysid compiles again for every fit; psa.identify keeps what it has compiled. It also"
+        " estimates the initial states, and decides what the force does between samples.",
+    )
 
 
 #: Runs all sets of a work: displacements (sets, n) [m]; not finite where one cannot be integrated.
