@@ -236,6 +236,7 @@ def input_(
     report: Path | None = None,
     check_fmu: bool = True,
     still: bool = False,
+    reading: Reading,
     inputs: Inputs,
 ) -> None:
     """Design the voltage for a path or for a quickest move; test it on simulator and FMU.
@@ -276,8 +277,10 @@ def input_(
     }  # fmt: skip
     named = {name: value for name, value in numbers.items() if value is not None}
     limits = inputs.attempt(lambda: AmplifierLimits(**named))
-    path = inputs.attempt(lambda: read_target(target)) if target is not None else None
-    trial = inputs.records([measured], Reading()) if measured is not None else []
+    paths, trials = [[p] if p is not None else [] for p in (target, measured)]
+    columns, step = inputs.columns(reading.columns, paths + trials) or {}, reading.sample_time
+    path = inputs.attempt(lambda: read_target(paths[0], columns, step)) if paths else None
+    trial = inputs.records(trials, reading, others=paths) if trials else []
     chosen = inputs.model_or_stack(model, stack)
     plant, limits = inputs.ready(chosen).plant(), inputs.ready(limits)
     task = runs.Task(plant, limits, output, report, still, check_fmu)

@@ -75,7 +75,7 @@ class Inputs:
     def check(self) -> None:
         """Raise an `InputError` with all problems, if there are any."""
         if self._problems or self._misfits:
-            raise InputError([*self._problems, *self._misfits])
+            raise InputError(list(dict.fromkeys([*self._problems, *self._misfits])))
 
     def ready(self, value: T | None) -> T:
         """Return what was read, None only with a problem; raises all of these as `check`."""
@@ -83,14 +83,18 @@ class Inputs:
         return cast("T", value)
 
     def records(
-        self, paths: Sequence[Path], reading: Reading, held_out: Sequence[Path] = ()
+        self,
+        paths: Sequence[Path],
+        reading: Reading,
+        held_out: Sequence[Path] = (),
+        others: Sequence[Path] = (),
     ) -> "list[psa.Record]":
         """Read records to fit, `fitted` of them, then those held out; none may come twice.
 
         A record to fit must have a voltage that changes, all must have a displacement. Nothing is
-        read where --columns is not understood.
+        read where --columns is not understood; it may name `others`, which are read elsewhere.
         """
-        wanted = self.columns(reading.columns, [*paths, *held_out])
+        wanted = self.columns(reading.columns, [*paths, *held_out, *others])
         if wanted is None:
             return []
         records: list[psa.Record] = []

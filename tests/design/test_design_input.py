@@ -35,6 +35,7 @@ from psa_casadi.design.tracking.tracking import (
     track,
 )
 from psa_casadi.examples.tracking_on_the_fmu import fmu_equations
+from psa_casadi.records.read.columns import parse_columns
 from psa_casadi.simulation.start import linear_part
 from tests.contract.helpers import done, refused
 from tests.export.fmu_models import exported
@@ -330,6 +331,17 @@ def test_a_move_obeys_rate_and_current() -> None:
     assert np.abs(rate).max() <= 8e5 * (1.0 + 1e-6)
     assert np.abs(quick_move.response.current).max() <= 0.9 * (1.0 + 1e-3)
     assert quick_move.residual < 1e-3
+
+
+def test_a_path_may_have_other_columns(tmp_path: Path) -> None:
+    path = tmp_path / "path.csv"
+    path.write_text("t,x\n" + "".join(f"{k},{2 * k}\n" for k in range(20)), encoding="utf-8")
+    of_path = "path.csv@time=t:ms,path.csv@displacement=x:nm"
+    target = read_target(path, parse_columns(f"{of_path},time=s:s,voltage=v:V"))
+    assert target.displacement[-1] == pytest.approx(38e-9)
+    assert target.time[-1] == pytest.approx(0.019)
+    target = read_target(path, parse_columns("displacement=x:nm"), sample_time=0.5)
+    assert target.step == pytest.approx(0.5)
 
 
 def test_mistakes_are_reported_together(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import os
 from dataclasses import dataclass
 from math import inf
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import runs_of
 from psa_casadi.records.read import apart
 from psa_casadi.records.read.choose import Request
+from psa_casadi.records.read.columns import ColumnMap, columns_of
 from psa_casadi.simulation.simulate import input_samples
 from psa_casadi.simulation.start import linear_part, start_state
 from psa_casadi.simulation.stepper import run
@@ -40,13 +42,20 @@ class Target:
         return float(np.median(np.diff(self.time)))
 
 
-def read_target(path: str | os.PathLike[str]) -> Target:
-    """Read a path from a CSV file with the columns `time [s]` and `displacement [um]`.
+def read_target(
+    path: str | os.PathLike[str],
+    columns: ColumnMap | None = None,
+    sample_time: float | None = None,
+) -> Target:
+    """Read a path from a file with the columns `time [s]` and `displacement [um]`.
+
+    `columns` says which of the file they are, `sample_time` [s] goes before its time.
 
     Raises InputError with every mistake: a column missing, a cell that is no number, times
     that do not increase, fewer than ten samples, a displacement that never changes.
     """
-    outcome = apart.read(str(path), Request(needed=("displacement",)))
+    sources = columns_of(columns or {}, Path(path).name)
+    outcome = apart.read(str(path), Request(sources, sample_time, needed=("displacement",)))
     if outcome.problems:
         raise InputError(outcome.problems)
     if not outcome.units:
@@ -59,8 +68,8 @@ def read_target(path: str | os.PathLike[str]) -> Target:
             f"{path}: line 1: the displacement is in counts of a sensor, which is no length;"
             " give the path in um."
         )
-    columns = dict(zip(units, outcome.values.T, strict=True))
-    time, displacement = (to_si(columns[n], units[n]) for n in ("time", "displacement"))
+    values = dict(zip(units, outcome.values.T, strict=True))
+    time, displacement = (to_si(values[n], units[n]) for n in ("time", "displacement"))
     return checked_target(time, displacement, str(path))
 
 
