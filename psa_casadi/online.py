@@ -314,19 +314,26 @@ _TUNED = ("position_controller", "hysteresis_compensator", *_OBSERVING, *_LEARNI
 
 
 def part_for(
-    name: str, stack: Model | None = None, *, period: float, noise: float | None = None
+    name: str,
+    stack: Model | None = None,
+    *,
+    period: float | None = None,
+    noise: float | None = None,
 ) -> Model:
-    """Return a part by name that acts every `period` [s], tuned to `stack` if it is not None.
+    """Return a part by name, tuned to `stack` if it is not None, that acts every `period` [s].
 
-    The position controller is that of `nanopositioner` around the stack. Observers, feed-forward
-    and identification have the stack's values; they see the command, amplifier included. `noise`
-    [m] is the rms error of sensor and model for those that learn, by default 0.1 % of the stroke.
+    Without `period` it acts as often as the part does by default. The position controller is that
+    of `nanopositioner` around the stack. Observers, feed-forward and identification have the
+    stack's values; they see the command, amplifier included. `noise` [m] is the rms error of sensor
+    and model for those that learn, by default 0.1 % of the stroke.
 
     Raises InputError for an unknown name, a part that is not tuned to a stack, and for what the
     tuning refuses.
     """
     bare = part_model(name)
     sampled = bare.structure.period
+    if period is None:
+        period = bare.values[sampled] if sampled else 0.0
     if stack is None:
         return bare.with_values({sampled: period} if sampled else {})
     if name not in _TUNED:

@@ -27,7 +27,7 @@ def c(
     step: str,
     model: Path | None = None,
     stack: StackName = None,
-    part: str | None = None,
+    part: PartName = None,
     precision: Literal["double", "single"] = "double",
     hold: Literal["linear", "zero"] = "linear",
     substeps: int | None = None,
@@ -43,10 +43,6 @@ def c(
         output: Folder of the two files.
         step: Time of a step with its unit, such as 10us.
         model: MODEL.json to export.
-        part: Part to export, tuned to the stack of --stack or --model if specified:
-            position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,
-            adaptive_feed_forward, online_identification. Others have their default values:
-            flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism.
         precision: Precision of all numbers.
         hold: Inputs reached at a step's end on a line, or held over it.
         substeps: Equal parts of a step; by default as few as err by less than 0.1 %.
@@ -56,11 +52,7 @@ def c(
         psa export c --stack P-885.51 --step 10us -o code
     """
     seconds = inputs.attempt(lambda: step_seconds(step))
-    base = chosen = None
-    if part is None or model or stack:
-        base = chosen = inputs.model_or_stack(model, stack, any_model=True)
-    if part is not None and seconds is not None and bool(model or stack) == (base is not None):
-        chosen = inputs.attempt(lambda: psa.part_for(part, base, period=seconds))
+    chosen = _chosen(inputs, model, stack, part, seconds)
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     period = inputs.ready(seconds)
     with working("generating") as progress:
@@ -75,6 +67,22 @@ def c(
     errors = {e.voltage: e.error for e in code_export.errors}
     _show_step(f"{period:g} s", code_export.substeps, precision, errors, code_export.limit)
     show_written(code_export.header, code_export.source)
+
+
+def _chosen(
+    inputs: Inputs,
+    model: Path | None,
+    stack: str | None,
+    part: str | None,
+    period: float | None = None,
+) -> "psa.Model | None":
+    """Return the model or named stack, or a part, tuned to these where one is named."""
+    base, named = None, model is not None or stack is not None
+    if named or part is None:
+        base = inputs.model_or_stack(model, stack, any_model=True)
+    if part is None or (named and base is None):
+        return base
+    return inputs.attempt(lambda: psa.part_for(part, base, period=period))
 
 
 def _show_inside(model: "psa.Model", include_sensor: bool) -> "psa.Model":
@@ -156,7 +164,7 @@ def fmu(
         if step is not None and solver == "fixed"
         else None
     )
-    chosen = inputs.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = _chosen(inputs, model, stack, part, seconds)
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     targets = inputs.ready(targets)
     if chosen.structure.foreign:
@@ -240,7 +248,7 @@ def modelica(
     from psa_casadi.export.modelica.package import class_names
 
     inputs.outputs({"--output": output}, [model])
-    chosen = inputs.model_or_stack(model, stack, part=part, any_model=True)
+    chosen = _chosen(inputs, model, stack, part)
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
     psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
     kept = _show_inside(chosen, include_sensor)

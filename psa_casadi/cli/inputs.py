@@ -194,22 +194,16 @@ class Inputs:
         path: Path | None,
         stack: str | None,
         *,
-        part: str | None = None,
         any_model: bool = False,
         needed: bool = True,
     ) -> "psa.Model | None":
-        """Read a model, or compose a named stack or part; one at most, and one where it is needed.
+        """Read a model, or compose a named stack; one at most, and one where it is needed.
 
         With `any_model` the file need not hold a stack, and FILE.py:FUNCTION makes the model.
         """
-        options = {"--model": path, "--stack": stack, "--part": part}
-        named = [name for name, value in options.items() if value is not None]
-        if len(named) > 1:
-            but_one = "one" if len(named) == 2 else "all but one"
-            self.add(f"{' and '.join(named)} exclude each other; leave {but_one} out.")
+        if path is not None and stack is not None:
+            self.add("--model and --stack exclude each other; leave one out.")
             return None
-        if part is not None:
-            return self.attempt(lambda: psa.part_model(part))
         if stack is not None:
             return self.attempt(lambda: psa.stack_model(stack))
         if path is None:

@@ -10,8 +10,10 @@ Options:
     records: Records of one device: CSV, Excel, MATLAB and other files.
     model: MODEL.json, as `psa identify`, `psa diagnose` and `psa design` write it.
     stack: Named stack in place of a model; `psa stacks` lists them.
-    part: Part around a stack, in place of a model: flexure_stage, position_controller,
-        hysteresis_compensator, voltage_amplifier, charge_amplifier.
+    part: Part to export, tuned to the stack of --stack or --model if specified:
+        position_controller, hysteresis_compensator, hysteresis_observer, feed_forward,
+        adaptive_feed_forward, online_identification. Others have their default values:
+        flexure_stage, voltage_amplifier, charge_amplifier, prestress_mechanism.
     platforms: host, all, or names such as x86_64-linux,x86_64-windows.
     include_sensor: Keep effects of sensor and environment.
     stiffness: Stiffness of the free stack [N/m]; fixes the force scale.

@@ -260,6 +260,18 @@ def test_an_fmu_of_a_users_model_is_read_back_and_runs_equally(tmp_path: Path) -
         psa.export_fmu(read, tmp_path / "again.fmu")
 
 
+def test_a_part_is_tuned_to_a_stack(tmp_path: Path) -> None:
+    stack = ("--stack", "P-885.51")
+    done("export", "fmu", "--part", "hysteresis_observer", *stack, "-o", tmp_path / "x.fmu")
+    tuned = psa.part_for("hysteresis_observer", psa.stack_model("P-885.51")).values
+    assert tuned != psa.part_model("hysteresis_observer").values
+    description = fmpy.read_model_description(str(tmp_path / "x.fmu"))
+    starts = {v.name: v.start for v in description.modelVariables if v.causality == "parameter"}
+    assert {n: float(starts[n] or 0) for n in tuned} == pytest.approx(tuned)
+    plain = ("export", "modelica", "--part", "flexure_stage", "-o", tmp_path / "x.mo")
+    assert "not tuned to a stack" in refused(*plain, *stack)
+
+
 @pytest.mark.parametrize("part", ["flexure_stage", "position_controller", "charge_amplifier"])
 def test_parts_are_exported(part: str, tmp_path: Path) -> None:
     done("export", "fmu", "--part", part, "-o", tmp_path / "x.fmu")
