@@ -17,7 +17,7 @@ pytestmark = pytest.mark.xdist_group("browser")
 
 #: One page of every kind: text and tables, code, a gallery, a notebook, what is made from code.
 SITE = (
-    "", "ablation", "evidence", "howto/simulink", "effects", "tutorials/laboratory_to_fmu",
+    "", "evidence", "howto/verdict", "howto/simulink", "effects", "tutorials/laboratory_to_fmu",
     "commands", "python", "json",
 )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -50,10 +51,10 @@ def run(progress: Progress, quick: bool) -> Outcome:
 
 def picture(known: SearchState, d: psa.StackDiagnosis) -> Figure:
     """Return scores of the hypotheses, and the shares of the budget."""
-    figure = Figure(figsize=(12.0, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
-    _scores(left, known)
-    _shares(right, d)
+    figure = Figure(figsize=(4.8, 7.2), layout="constrained")  # as wide as a phone
+    above, below = figure.subplots(2, 1, height_ratios=(2.2, 1.0))
+    _scores(above, known)
+    _shares(below, d)
     return figure
 
 
@@ -64,29 +65,29 @@ def _scores(axes: Axes, known: SearchState) -> None:
         for h in rows
     ]
     scores = [max(known.scale.score(h), 0.0) for h in rows]
-    axes.barh([_named(h) for h in rows], scores, color=colours)
+    axes.barh([fill(_named(h), 26) for h in rows], scores, color=colours)
     axes.set_xlabel("score [ln units]")
-    title = "Blue: the answer; orange: may be it;\ngrey: fails a rule"
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.tick_params(labelsize=8)
+    axes.set_title("blue: answer; orange: may be it; grey: fails", loc="right", fontsize=10)
+    axes.tick_params(labelsize=9)
 
 
 def _shares(axes: Axes, d: psa.StackDiagnosis) -> None:
     b = d.budget
-    shares = {plain(s.what).replace(" ", "\n"): s for s in b.causes}
+    shares = {plain(s.what): s for s in b.causes}
     if b.unnamed is not None and d.patch is not None:
-        shares[f"unnamed:\n{d.patch.kind}"] = b.unnamed
+        shares[f"unnamed: {d.patch.kind}"] = b.unnamed
     values = np.array([s.share for s in shares.values()])
     ends = np.clip([s.interval for s in shares.values()], 0.0, 1.0)
     reach = 100.0 * np.abs(ends.T - values)
-    axes.bar(list(shares), 100.0 * values, color=_BLUE, yerr=reach, capsize=4)
+    axes.barh(list(shares), 100.0 * values, color=_BLUE, xerr=reach, capsize=4)
     left = 100.0 * (b.remains_rms_m / max(b.excess_rms_m, 1e-300)) ** 2
-    axes.bar(["remains"], [left], color=_GREY)
+    axes.barh(["remains"], [left], color=_GREY)
+    axes.invert_yaxis()
     scale = length_scale(b.excess_rms_m)
-    axes.set_ylabel("share of the excess [%]")
+    axes.set_xlabel("share of the excess [%]")
     title = f"Of {scale.text(b.excess_rms_m)} above the noise of {scale.text(b.noise_rms_m)}"
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.tick_params(labelsize=8)
+    axes.set_title(title, loc="right", fontsize=10)
+    axes.tick_params(labelsize=9)
 
 
 def _best(known: SearchState) -> Sequence[Hypothesis]:
