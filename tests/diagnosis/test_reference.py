@@ -12,6 +12,7 @@ from psa_casadi.diagnosis.reference import Healthy
 from psa_casadi.identification.fitting.fit import fit
 from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import whole
+from psa_casadi.report.words.verdict_words import verdict_sentence
 from tests.any_model.own_models import oven
 from tests.studies.exam.play import play
 from tests.studies.exam.records import RECORDS
@@ -64,6 +65,7 @@ def test_nothing_has_changed_in_the_same_test_of_a_healthy_device(sound: psa.Rec
     assert "since_moved" not in notes
     # the base lacks the hysteresis: what is taken off is far above the noise
     assert notes["since"].values["removed"][0] > 2.0 * d.noise_floor_rms_m
+    assert "Nothing has changed since the reference" in verdict_sentence(d)
 
 
 def test_a_gain_that_has_changed_is_reported_as_a_parameter() -> None:
@@ -75,6 +77,7 @@ def test_a_gain_that_has_changed_is_reported_as_a_parameter() -> None:
     assert moved["name"] == "k_P"
     assert moved["values"][1] > moved["values"][0]  # stiffer: less displacement
     assert "since the reference" in " ".join(d.notes)
+    assert "Of the base model k_P has changed" in verdict_sentence(d)
 
 
 def test_what_the_device_adds_is_predicted_where_the_voltage_is_another() -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from psa_casadi.common.units import convert
 from psa_casadi.diagnosis.result import Cause, Diagnosis
+from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.model.compose import Model
 from psa_casadi.records.split import Experiment
 
@@ -188,9 +189,15 @@ def confidence_text(confidence: float) -> str:
 
 
 def rest_sentence(d: Diagnosis) -> str:
-    """Say what remains, with the p value of the test of the rest."""
-    p = d.remaining.p_value
-    return f"{d.remaining.where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
+    """Say what remains, with the p value of the test of the rest.
+
+    It is of white noise: a small one is left out where noise of another colour, or below the
+    detection limit, is what remains.
+    """
+    p, where = d.remaining.p_value, d.remaining.where
+    if d.remaining.white and p < Thresholds().alarm:
+        return where
+    return f"{where.rstrip('.')} ({f'p = {number(p, 2)}' if p > 1e-6 else 'p < 1e-6'})."
 
 
 def plain(name: str) -> str:

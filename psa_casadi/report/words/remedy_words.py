@@ -33,6 +33,7 @@ from psa_casadi.report.words.phrases import (
     with_unit,
     within,
 )
+from psa_casadi.report.words.verdict_words import since_reference
 
 #: What can be done by the codes of remedies, and the record that shows an effect by its test.
 DO: Mapping[str, str] = TABLES["remedy"]
@@ -103,7 +104,8 @@ def what_now(d: Diagnosis, model_file: str | None = None) -> Advice:
     if d.verdict == "adequate" and d.doubt:
         return Advice((say("now.unconfirmed"),), remarks, commands[:1])
     if d.verdict == "adequate":
-        text = say("now.adequate", errors=errors, noise=noise, stack=stack)
+        since = since_reference(d)
+        text = say("now.adequate", errors=errors, noise=noise, stack=stack, **since)
         return Advice((text,), remarks, commands)
     if not d.causes:
         if d.patch is not None and d.budget.unnamed is not None:

@@ -5,6 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.corrections import Correction, Family, Patch
 from psa_casadi.diagnosis.held_out import Budget, Share, StackBudget
 from psa_casadi.diagnosis.result import (
@@ -46,7 +47,7 @@ def gain_sentence(d: StackDiagnosis) -> str:
 def verdict_sentence(d: Diagnosis) -> str:
     """Say the verdict in one sentence, with confidence and gain."""
     code: str = d.verdict
-    values: dict[str, Any] = {"d": d, "base": _base_errors}
+    values: dict[str, Any] = {"d": d, "base": _base_errors, **since_reference(d)}
     if d.doubt:
         code = "unconfirmed" if d.verdict == "adequate" else "doubted"
     elif d.verdict == "not_driven" and doubtful_sign([e.record for e in d.experiments]):
@@ -57,6 +58,12 @@ def verdict_sentence(d: Diagnosis) -> str:
         else:
             values |= _named(d)
     return say(f"verdict.{code}", **values)
+
+
+def since_reference(d: Diagnosis) -> dict[str, Any]:
+    """Return whether a diagnosis has a reference, and which base parameter has changed since."""
+    notes = {n.code: n.values for n in d.remarks if isinstance(n, Note)}
+    return {"since": "since" in notes, "moved": notes.get("since_moved", {}).get("name", "")}
 
 
 def _named(d: Diagnosis) -> dict[str, Any]:
