@@ -98,7 +98,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     velocity = der(x);
     annotation(Documentation(info="<html>
   <p>co-fired PICMA stack of Physik Instrumente, 120 V, 18 um, 1.5 uF, overdamped; 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51). The force scale is assumed: only quantities scaled to displacement are identified; forces, masses, damping and stiffness share one unknown factor. Named stack P-885.51: 14 of its 19 figures are assumed; `psa stacks P-885.51` shows which.</p>
-  <p>Written by psa_casadi 0.2.0.</p>
+  <p>Written by psa_casadi 1.0.0.</p>
   <table>
   <tr><th>component</th><th>what it is</th><th>equation</th><th>source</th></tr>
   <tr><td>drive</td><td>amplifier of gain G and output resistance R_s charging the stack (C_p)</td><td>C_p u' = i,  i = (G v - u) / R_s</td><td>circuit of a stack on a voltage amplifier; supplies u' to Yang and Zhu 2015, eq. 8</td></tr>
@@ -235,7 +235,7 @@ package PiezoStack "model of a device, written by psa_casadi"
     flange_b.f = load_force;
     annotation(Documentation(info="<html>
   <p>co-fired PICMA stack of Physik Instrumente, 120 V, 18 um, 1.5 uF, overdamped; 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51). The force scale is assumed: only quantities scaled to displacement are identified; forces, masses, damping and stiffness share one unknown factor. Named stack P-885.51: 14 of its 19 figures are assumed; `psa stacks P-885.51` shows which.</p>
-  <p>Written by psa_casadi 0.2.0.</p>
+  <p>Written by psa_casadi 1.0.0.</p>
   <p>The pins are the terminals behind the amplifier's gain G: between them is G times the voltage command, and the current is what flows into the stack. The motion does not act back on the charge. The flange is the stack's output, its position the displacement from rest, with the other end clamped.</p>
   <p>The paper's one-way cascade has no reaction of the bonding layers on the wafers, so that it cannot be a two-port. This class has it: reciprocal_gain = 1, action and reaction. With the same parameters the static stroke per force is k_B/(k_P + k_B) = 0.1667 times that of the cascade at reciprocal_gain = 0, and the output's stiffness is that of wafers and bonding layers in series, k_P k_B/(k_P + k_B) = 4.167e+07 N/m in place of k_B = 5e+07 N/m. Where the parameters were found with the cascade, find them again with reciprocal_coupling at 1, or scale the forces (k_L, A, beta, gamma, delta, h_ref) by (k_P + k_B)/k_B for the same free stroke.</p>
   <table>
@@ -322,7 +322,7 @@ package PiezoStack "model of a device, written by psa_casadi"
 
   annotation(Documentation(info="<html>
 <p>co-fired PICMA stack of Physik Instrumente, 120 V, 18 um, 1.5 uF, overdamped; 5 x 5 x 18 mm (the paper's type name is lost; the figures are those of the P-885.51). The force scale is assumed: only quantities scaled to displacement are identified; forces, masses, damping and stiffness share one unknown factor. Named stack P-885.51: 14 of its 19 figures are assumed; `psa stacks P-885.51` shows which.</p>
-<p>Written by psa_casadi 0.2.0.</p>
+<p>Written by psa_casadi 1.0.0.</p>
 <p>Signal needs no library. Acausal has pins and flanges of the Modelica Standard Library 4. All quantities are in SI units; states start at rest.</p>
 </html>"), uses(Modelica(version="4.0.0")));
 end PiezoStack;
