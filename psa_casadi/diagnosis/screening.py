@@ -155,7 +155,7 @@ def _unit_vectors(
     """
     norms = np.linalg.norm(left, axis=0)
     usable = norms > least * np.linalg.norm(whole, axis=0)
-    return np.where(usable, left / np.where(usable, norms, 1.0), 0.0), norms * usable
+    return np.where(usable, left / np.where(usable, norms, 1.0), 0.0), np.where(usable, norms, 0.0)
 
 
 def _of_span(directions: Sequence[Direction], span: Span, t: FloatArray) -> Score:
