@@ -371,9 +371,11 @@ class Judge:
             why = self.doubt
         elif self.unlisted:
             why = self._better()
-        else:
+        elif share < self.least:
             more = self.last.test.alarm
             why, kept = note("little", least=self.least, more=more), self.adds
+        else:
+            why, kept = note("rare"), self.adds
         return (
             note("withdrawn", names=names, evidence=self.weighed.evidence, share=max(0.0, share),
                  output=output, kept=kept, why=why),

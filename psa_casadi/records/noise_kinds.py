@@ -230,6 +230,8 @@ class _Residual:
         jumps = jumps_in(robust)
         if jumps is None or jumps.score < least or self._with_drive(jumps.places):
             return None, misfit, colour
+        if jumps.undone and not jumps.alternate:
+            return None, misfit, colour
         return jumps, *self._misfit(robust - jumps.levels)[::2]
 
     def _jumping(self, jumps: Jumps) -> NoiseKind:

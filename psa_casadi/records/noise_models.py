@@ -421,6 +421,17 @@ class Jumps:
         turns = up[1:] != up[:-1]
         return bool(up.size > _FEW and turns.mean() > 0.8 and np.std(size) < 0.4 * np.mean(size))
 
+    @property
+    def undone(self) -> bool:
+        """Whether every jump belongs to a pair within `_REACH` samples that cancels: outliers."""
+        before, last = self.places - 1, self.levels.size - 1
+        ways = (
+            (np.minimum(self.places + _REACH, last), before),
+            (self.places, np.maximum(before - _REACH, 0)),
+        )
+        moved = np.min([np.abs(self.levels[b] - self.levels[a]) for b, a in ways], axis=0)
+        return bool(np.all(moved < 0.5 * np.abs(self.sizes)))
+
 
 def two_levels(signal: FloatArray) -> Jumps | None:
     """Return the two levels between which a signal (n,) jumps, None without any."""

@@ -121,6 +121,12 @@ def outliers_and_lines(rng: Rng, y: FloatArray) -> FloatArray:
     return lines(rng, y) - rng.standard_normal(N) + outliers(rng, y)
 
 
+def short_step(rng: Rng, y: FloatArray) -> FloatArray:
+    """Three readings in a row that are far off, as of a sensor that hangs."""
+    place = int(rng.integers(500, N - 500))
+    return rng.standard_normal(N) + 40.0 * ((place <= np.arange(N)) & (np.arange(N) < place + 3))
+
+
 Noise = Callable[[Rng, FloatArray], FloatArray]
 NOISES = (autoregressive, one_over_f, telegraph, steps, heavy_tails, outliers, jitter, lines)
 KINDS: dict[str, Noise] = {noise.__name__: noise for noise in NOISES}
@@ -176,6 +182,11 @@ def clear_telegraph(rng: Rng, y: FloatArray) -> FloatArray:
 def test_jumps_are_detected_on_a_wander(noise: Noise) -> None:
     kind = noise.__name__.removeprefix("clear_")
     assert sum(kind in kinds for kinds in named_in_records(on_a_wander(noise))) >= 18
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_returns_at_once_is_no_step(seed: int) -> None:
+    assert "steps" not in {k.kind for k in kinds_in(short_step, fading, seed)}
 
 
 def test_figures_are_those_of_the_noise() -> None:
