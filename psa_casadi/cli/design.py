@@ -278,9 +278,12 @@ def input_(
     named = {name: value for name, value in numbers.items() if value is not None}
     limits = inputs.attempt(lambda: AmplifierLimits(**named))
     paths, trials = [[p] if p is not None else [] for p in (target, measured)]
-    columns, step = inputs.columns(reading.columns, paths + trials) or {}, reading.sample_time
-    path = inputs.attempt(lambda: read_target(paths[0], columns, step)) if paths else None
-    trial = inputs.records(trials, reading, others=paths) if trials else []
+    path, trial = None, []
+    columns = inputs.columns(reading.columns, None if trials else paths)  # else `records` checks
+    if columns is not None and paths:
+        path = inputs.attempt(lambda: read_target(paths[0], columns, reading.sample_time))
+    if columns is not None and trials:
+        trial = inputs.records(trials, reading, others=paths)
     chosen = inputs.model_or_stack(model, stack)
     plant, limits = inputs.ready(chosen).plant(), inputs.ready(limits)
     task = runs.Task(plant, limits, output, report, still, check_fmu)

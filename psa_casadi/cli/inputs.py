@@ -75,7 +75,7 @@ class Inputs:
     def check(self) -> None:
         """Raise an `InputError` with all problems, if there are any."""
         if self._problems or self._misfits:
-            raise InputError(list(dict.fromkeys([*self._problems, *self._misfits])))
+            raise InputError([*self._problems, *self._misfits])
 
     def ready(self, value: T | None) -> T:
         """Return what was read, None only with a problem; raises all of these as `check`."""

@@ -228,9 +228,7 @@ class _Residual:
             return None, misfit, colour
         least = score(robust - misfit, colour) - price + LEAST
         jumps = jumps_in(robust)
-        if jumps is None or jumps.score < least or self._with_drive(jumps.places):
-            return None, misfit, colour
-        if jumps.undone and not jumps.alternate:
+        if jumps is None or jumps.score < least or jumps.undone or self._with_drive(jumps.places):
             return None, misfit, colour
         return jumps, *self._misfit(robust - jumps.levels)[::2]
 

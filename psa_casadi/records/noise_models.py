@@ -423,14 +423,17 @@ class Jumps:
 
     @property
     def undone(self) -> bool:
-        """Whether every jump belongs to a pair within `_REACH` samples that cancels: outliers."""
+        """Whether every jump is one of a pair within `_REACH` samples that cancels: outliers.
+
+        Not where jumps alternate between two levels.
+        """
         before, last = self.places - 1, self.levels.size - 1
         ways = (
             (np.minimum(self.places + _REACH, last), before),
             (self.places, np.maximum(before - _REACH, 0)),
         )
         moved = np.min([np.abs(self.levels[b] - self.levels[a]) for b, a in ways], axis=0)
-        return bool(np.all(moved < 0.5 * np.abs(self.sizes)))
+        return bool(np.all(moved < 0.5 * np.abs(self.sizes))) and not self.alternate
 
 
 def two_levels(signal: FloatArray) -> Jumps | None:
