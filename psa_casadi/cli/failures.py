@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, ParamSpec
+from typing import Any, NoReturn, ParamSpec
 
 import typer
 
@@ -194,12 +194,13 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
     """Return the command with its errors as sentences, without a traceback.
 
     Exit code 2: what the user gave cannot be used; every mistake is listed. Exit code 1: a failure
-    that is not the user's. 130: interrupted; the message names what was kept.
+    that is not the user's. 130: interrupted; the message names what was kept. `--junit` gets an
+    error as a failed test.
     """
 
     @functools.wraps(command)
     def run(*args: P.args, **options: P.kwargs) -> None:
-        before = len(written())
+        before, began = len(written()), time.perf_counter()
         try:
             with interrupts():
                 command(*args, **options)
@@ -221,8 +222,10 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             if os.environ.get(DEBUG):
                 raise
             cause = InputError(_NOWHERE) if _is_nowhere(error) else error
-            for line in _error_lines(cause):
+            lines = _error_lines(cause)
+            for line in lines:
                 print_message(line)
+            _error_to_junit(command.__name__, options, lines, began)
             raise typer.Exit(2 if isinstance(cause, InputError) else 1) from error
 
     return run
@@ -289,6 +292,22 @@ def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float
         ElementTree.SubElement(test, "system-out").text = plain(case.result)
     ElementTree.indent(suites)
     return ElementTree.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _error_to_junit(
+    command: str, options: Mapping[str, Any], lines: Sequence[str], began: float
+) -> None:
+    """Write an error to the file of --junit, if one is named: no older result stays there.
+
+    A file that is there and no JUnit is left as it is: it may be named by mistake.
+    """
+    junit = options.get("junit")
+    with suppress(OSError, PsaError):
+        if junit and (not junit.exists() or b"<testsuites" in junit.read_bytes()[:200]):
+            subject = ", ".join(p.name for p in options.get("records") or [options["fmu"]])
+            case = Case("run", "", "\n".join(lines))
+            seconds = time.perf_counter() - began
+            atomic_write(junit, junit_text(command, subject, [case], seconds))
 
 
 def judge(

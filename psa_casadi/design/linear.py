@@ -78,7 +78,7 @@ class Linear(Celled):
         at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.input_names, self.u, strict=True))
         lines = [f"'{self.name}' about {at or 'its start'}: {len(self.x)} states"]
         if self.held:
-            lines.append(f"  held: {', '.join(self.held)}")
+            lines.append(f"  constant here, rests at any value: {', '.join(self.held)}")
         for p in self.poles:
             size, real = abs(p), p.real
             if p.imag > 0.0:

@@ -246,6 +246,21 @@ def test_what_is_expected_decides_the_exit_code(tmp_path: Path) -> None:
     assert junit(tmp_path / "d.xml") == {"verdict": True, "held-out error": True}
 
 
+def test_an_unusable_record_fails_a_test_and_leaves_other_files(tmp_path: Path) -> None:
+    record, results = tmp_path / "a.csv", tmp_path / "d.xml"
+    write(record, dict.fromkeys(("time [s]", "voltage [V]", "displacement [m]"), np.arange(2.0)))
+    before = record.read_bytes()
+    ended = command("diagnose", record, "--junit", results)
+    assert ended.code == 2
+    assert junit(results) == {"run": True}
+    assert "found 2 samples" in results.read_text(encoding="utf-8")
+    for other in ("diagnose", tmp_path / "b.csv"), ("check", tmp_path / "b.fmu"):
+        assert command(*other, "--junit", record).code == 2
+        assert record.read_bytes() == before
+        assert command(*other, "--junit", results).code == 2
+        assert "there is no such file" in results.read_text(encoding="utf-8")
+
+
 def test_a_model_with_a_value_on_its_bound_hides_no_cause(demo: Demo, tmp_path: Path) -> None:
     """The base fit imitates creep by a damping at its bound; the diagnosis starts elsewhere."""
     model = demo.folder / "model.json"
