@@ -127,7 +127,7 @@ def colour_of(
     correlation = float(np.clip(correlation_left, 0.0, _LARGEST))
     shared: FloatArray = np.array([correlation] if correlation >= _WHITE else [])
     each = tuple(shared if regression is None else regression for regression in regressions)
-    return _with_level(each, remainder, lengths)
+    return _with_level(each, remainder, lengths, 0 if removed is None else removed.shape[1])
 
 
 def left_correlation(correlation: float, removed: Sequence[FloatArray]) -> float:
@@ -241,11 +241,16 @@ def residual_colour(parts: Sequence[FloatArray]) -> Colour:
 
 
 def _with_level(
-    autoregression: tuple[FloatArray, ...], signal: FloatArray, lengths: Sequence[int]
-) -> Colour:
-    """Return the colour whose level is that of the whitened signal."""
+    autoregression: tuple[FloatArray, ...], signal: FloatArray, lengths: Sequence[int],
+    removed: int = 0,
+) -> Colour:  # fmt: skip
+    """Return the colour whose level is that of the whitened signal.
+
+    So many directions were `removed` of it: the square sum has fewer degrees of freedom by them.
+    """
     colour = Colour(autoregression, 1.0, tuple(lengths))
-    level = float(np.sqrt(np.mean(colour.whiten(signal) ** 2)))
+    freedom = max(len(signal) - removed, 1)
+    level = float(np.sqrt(np.sum(colour.whiten(signal) ** 2) / freedom))
     return replace(colour, level=max(level, 1e-15))
 
 

@@ -37,6 +37,8 @@ _SEED = 20150810  # of the threshold's simulation: the same data give the same v
 #: Share of the best score below which an effect is not fitted; number of the others that are, and
 #: largest number where more have a score above the last share of the best one.
 _WORTH, _LEADING, _MOST, _AS_NEAR = 0.1, 4, 7, 0.4
+#: Fewest degrees of freedom for a noise level: its standard error is 1/sqrt(2 f), here 18 %.
+_FREEDOM = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +142,14 @@ def _unexplained(
     f: Further, columns: FloatArray, lengths: Sequence[int],
     known: Sequence[FloatArray | None] | None = None,
 ) -> Colour:  # fmt: skip
-    """Return the colour of what neither fit nor directions explain of a channel."""
+    """Return the colour of what neither fit nor directions explain of a channel.
+
+    Where directions leave too few degrees of freedom, of what the fit alone does not explain.
+    """
     fitted = independent(f.jacobian)
     every = independent(np.hstack([f.basis, fitted, without(columns, fitted)]))
+    if len(f.residuals) - every.shape[1] < _FREEDOM:
+        every = independent(np.hstack([f.basis, fitted]))
     return colour_of(without(f.residuals, every), lengths, known, every)
 
 

@@ -54,6 +54,14 @@ def test_a_colour_survives_the_projection_of_slow_directions(correlation: float)
     assert left_correlation(correlation, halves) == pytest.approx(np.mean(plain), abs=0.015)
 
 
+def test_directions_taken_out_of_few_samples_do_not_lower_the_noise() -> None:
+    n, rng = 150, np.random.default_rng(7)
+    basis = np.linalg.qr(rng.standard_normal((n, 100)))[0]
+    drawn = [rng.standard_normal(n) for _ in range(40)]
+    levels = [colour_of(e - basis @ (basis.T @ e), [n], [np.zeros(0)], basis).level for e in drawn]
+    assert np.mean(levels) == pytest.approx(1.0, abs=0.06)
+
+
 @pytest.mark.parametrize(("correlation", "n"), [(0.0, 4000), (0.6, 5000), (0.75, 3000)])
 def test_the_power_of_noise_is_as_uncertain_as_draws_of_it_show(correlation: float, n: int) -> None:
     rng = np.random.default_rng(8)
