@@ -24,7 +24,6 @@ from psa_casadi.diagnosis.search.state import Step, steps_of, unsearched
 from psa_casadi.diagnosis.task import Method, Thresholds, Tried
 from psa_casadi.diagnosis.verdict import StackJudge
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import identify, unfinished
 from psa_casadi.identification.inputs import even_clock, smooth_between
 from psa_casadi.identification.prepare import COLUMNS, averaged, columns_of, with_levels
@@ -91,7 +90,7 @@ def driven(base: Fit, model: Model, task: Task) -> Driven:
     if share >= limits.follows and doubts.correlation(records) > limits.falling:
         return Driven(follows=True, notes=notes)
     progress("the displacement with flipped sign")
-    flipped = [replace(r, displacement=-measured(r)) for r in records]
+    flipped = [replace(r, displacement=-r.measured) for r in records]
     turned = [replace(e, record=r) for e, r in zip(experiments, flipped, strict=True)]
     other, positive = 0.0, max(share, 0.0)
     with suppress(PsaError):
@@ -115,7 +114,7 @@ def explained(base: Fit) -> float:
     """
     left = total = 0.0
     for e, y in zip(base.experiments, base.predicted(), strict=True):
-        inputs = measured(e.record)
+        inputs = e.record.measured
         valid = np.isfinite(inputs)
         time, v = e.record.time[valid], e.record.voltage[valid]
         moving = np.sum(_about_trend(time, v) ** 2) > _TREND * np.sum((v - np.mean(v)) ** 2)
@@ -141,7 +140,7 @@ def filtered(experiments: Sequence[Experiment]) -> float:
     """
     left = total = 0.0
     for e in experiments:
-        record, y = e.record, measured(e.record)
+        record, y = e.record, e.record.measured
         taps = max(1, min(_TAPS, record.n // _EACH))
         past = np.concatenate([np.full(taps - 1, record.voltage[0]), record.voltage])
         lagged = np.lib.stride_tricks.sliding_window_view(past, taps)[record.mask]

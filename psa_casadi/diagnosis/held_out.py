@@ -27,7 +27,6 @@ from psa_casadi.diagnosis.colour import Colour, OwnColour, rms
 from psa_casadi.diagnosis.noise import NoiseFloor, detection_limit_of
 from psa_casadi.diagnosis.task import Thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import doubtful_quantity, doubtful_voltage
 from psa_casadi.records.record import FEWEST_SAMPLES
 from psa_casadi.records.split import Experiment, Kind, counted, counts
@@ -129,7 +128,7 @@ def whole_residuals(
     experiments: Sequence[Experiment], predicted: Sequence[FloatArray]
 ) -> list[FloatArray]:
     """Return measured minus predicted [m] of every record, nan where nothing was measured."""
-    return [measured(e.record) - y for e, y in zip(experiments, predicted, strict=True)]
+    return [e.record.measured - y for e, y in zip(experiments, predicted, strict=True)]
 
 
 def errors_of(experiments: Sequence[Experiment], predicted: Sequence[FloatArray]) -> Errors:

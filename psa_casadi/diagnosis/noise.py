@@ -13,7 +13,6 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.colour import Colour, noise_rms, rms
 from psa_casadi.diagnosis.task import LIMITS, Thresholds
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.noise import first_order_noise, last_place_of, quantum_of
 from psa_casadi.records.record import Record
 from psa_casadi.records.repeats import MeasuredNoise, holds, repeats
@@ -365,7 +364,7 @@ def without_stuck_readings(fit: Fit) -> tuple[tuple[Experiment, ...], int]:
     """
     kept, count = [], 0
     for e, predicted in zip(fit.experiments, fit.predicted(), strict=True):
-        y = measured(e.record)
+        y = e.record.measured
         residual = np.abs(y - predicted)
         again = np.r_[False, np.diff(y) == 0.0]
         noise = 1.4826 * float(np.nanmedian(residual))

@@ -23,7 +23,7 @@ import scipy
 from psa_casadi.common.errors import PsaError
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, outputs_of, trace_record
+from psa_casadi.identification.fitting.prediction import outputs_of, trace_record
 from psa_casadi.identification.fitting.unknowns import LINEAR_PRIOR
 from psa_casadi.model.component import (
     DISPLACEMENT_PEAKS,
@@ -116,7 +116,7 @@ def _binned(fit: Fit) -> tuple[float, float, FloatArray, FloatArray]:
     for k, (e, residual) in enumerate(zip(fit.experiments, fit.record_residuals, strict=True)):
         if e.held_out_whole:
             continue
-        reading = measured(e.record)[: e.stop][e.used[: e.stop]]
+        reading = e.record.measured[: e.stop][e.used[: e.stop]]
         parts.append((reading - residual - fit.offset(k), residual))
     x, residual = max(parts, key=lambda part: float(np.ptp(part[0])))
     low, span = float(x.min()), float(np.ptp(x))
@@ -358,7 +358,7 @@ def _histories(fit: Fit, effect: Component, model: Model) -> list[tuple[dict[str
         return [tuple(known)]
     cycled = []
     for memory, e in zip(known, fit.experiments, strict=True):
-        y = measured(e.record)[e.known]
+        y = e.record.measured[e.known]
         cycled.append({**memory, **dict.fromkeys(settling, float(np.mean(y) - y[0]))})
     return [tuple(known), tuple(cycled)]
 

@@ -31,7 +31,6 @@ from psa_casadi.diagnosis.noise import noise_floor
 from psa_casadi.diagnosis.result import StackDiagnosis
 from psa_casadi.diagnosis.task import Method
 from psa_casadi.identification.fitting.fit import Fit, fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.refitting import noise_levels
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.noise import high_frequency_noise
@@ -101,7 +100,7 @@ class Healthy:
     def residuals(self) -> list[FloatArray]:
         """Measured minus predicted of every record (n,) [m], about its mean, nan where none."""
         pairs = zip(self.experiments, self.fit.predicted(), strict=True)
-        left = [np.where(e.used, measured(e.record) - y, np.nan) for e, y in pairs]
+        left = [np.where(e.used, e.record.measured - y, np.nan) for e, y in pairs]
         return [r - np.nanmean(r) for r in left]
 
     def adds(self, records: Sequence[Record]) -> tuple[list[FloatArray], int]:
@@ -232,7 +231,7 @@ class Since:
         """Return the new records without it, the first ones (as many as `first`) and the others."""
         rows = zip(self.records, self.added, self.covered, strict=True)
         result = tuple(
-            replace(r, displacement=np.where(s, measured(r) - a, np.nan)) for r, a, s in rows
+            replace(r, displacement=np.where(s, r.measured - a, np.nan)) for r, a, s in rows
         )
         return result[:first], result[first:]
 

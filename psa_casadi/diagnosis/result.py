@@ -16,7 +16,6 @@ from psa_casadi.diagnosis.misfit import Misfit
 from psa_casadi.diagnosis.noise import NoiseFloor
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise_kinds import NoiseFound, notes_of
 from psa_casadi.records.split import Experiment
@@ -390,7 +389,7 @@ class StackDiagnosis(Diagnosis):
         held_out, records = columns.pop("held_out"), [e.record for e in self.experiments]
         columns |= {
             "voltage": np.concatenate([r.voltage for r in records]),
-            "measured": np.concatenate([measured(r) for r in records]),
+            "measured": np.concatenate([r.measured for r in records]),
             "base": np.concatenate(self.base),
             "extended": np.concatenate(self.extended),
             "held_out": held_out,

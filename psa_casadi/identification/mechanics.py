@@ -29,7 +29,7 @@ from psa_casadi.common.progress import Progress
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured, predict
+from psa_casadi.identification.fitting.prediction import predict
 from psa_casadi.identification.fitting.unknowns import static_compliance, unknowns_of, within_bounds
 from psa_casadi.identification.refitting import (
     differing,
@@ -267,7 +267,7 @@ def _parts(best: Fit) -> Iterator[Excerpt]:
     fastest = min(e.record.sample_time for e in fitted(best.experiments))
     values, levels, total = best.model.values, residual_noise(best), 0
     for k, e in enumerate(best.experiments):
-        record, y = e.record, measured(e.record)
+        record, y = e.record, e.record.measured
         steps, there = np.diff(record.time), np.isfinite(y)
         uneven = np.ptp(steps) > 0.01 * record.sample_time
         if uneven or record.sample_time > _SLOWER * fastest or total >= _ALL:

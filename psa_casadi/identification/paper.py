@@ -22,7 +22,6 @@ from psa_casadi.common.notes import Note, note, texts
 from psa_casadi.common.units import BoolArray, ComplexArray, FloatArray, IndexArray
 from psa_casadi.identification.determinacy import determinacy
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance
 from psa_casadi.identification.identify import StackIdentification, with_provenance
 from psa_casadi.identification.refitting import noise_levels
@@ -91,7 +90,7 @@ def find_loops(records: Sequence[Record]) -> list[Loop]:
 
 
 def _step_of(record: Record) -> Step | None:
-    t, v, x = record.time, record.voltage, measured(record)
+    t, v, x = record.time, record.voltage, record.measured
     volts = float(np.median(v[record.n // 2 :]) - v[0])
     if abs(volts) < 0.5 * float(np.ptp(v)) or volts == 0.0:
         return None
@@ -123,7 +122,7 @@ def _loop_of(record: Record) -> Loop | None:
         return None
     t = np.arange(record.time[0], record.time[-1] + 0.5 * step, step)
     v = np.interp(t, record.time, record.voltage)
-    x = np.interp(t, record.time[valid], measured(record)[valid])
+    x = np.interp(t, record.time[valid], record.measured[valid])
     turns = reversals(v, _PROMINENCE * float(np.ptp(v)))
     if turns.size == 0:
         return None

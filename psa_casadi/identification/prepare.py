@@ -8,7 +8,6 @@ import numpy as np
 
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import Note, note
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.doubts import static_slope
 from psa_casadi.identification.start.ordinary import capacitance_of
 from psa_casadi.identification.start.two_clocks import on_one_clock
@@ -71,7 +70,7 @@ def averaged(records: Sequence[Record]) -> tuple[list[Record], list[Note]]:
 
 def _averaged(record: Record) -> tuple[Record, tuple[Note, ...]]:
     """Return a record of block averages, where they lose nothing, and a note on it."""
-    y = measured(record)
+    y = record.measured
     noise, slope = fast_noise(y[np.isfinite(y)]), static_slope([record])
     if noise <= 0 or slope == 0:
         return record, ()

@@ -9,7 +9,6 @@ import numpy as np
 from psa_casadi.common.errors import PsaError
 from psa_casadi.identification.determinacy import covariance_of
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, How, fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.compose import Model
 from psa_casadi.records.noise import first_order_noise, high_frequency_noise, uncertain
 from psa_casadi.records.split import Experiment
@@ -34,7 +33,7 @@ def noise_levels(experiments: Sequence[Experiment]) -> list[float]:
     """Return the white noise of every record's displacement [m], from its fast differences."""
     levels = []
     for e in experiments:
-        y = measured(e.record)[e.known]
+        y = e.record.measured[e.known]
         levels.append(max(high_frequency_noise(y), 1e-6 * float(np.ptp(y)), 1e-15))
     return levels
 

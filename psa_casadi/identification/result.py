@@ -16,7 +16,7 @@ from psa_casadi.common.strict_json import json_text
 from psa_casadi.common.units import BoolArray, FloatArray
 from psa_casadi.identification.determinacy import Determinacy
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import OUTPUT, measured, record_start
+from psa_casadi.identification.fitting.prediction import OUTPUT, record_start
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import Covariance, Evidence, RecordRun, ReferenceRun, SeenRange
 from psa_casadi.model.variables import Interval, Provenance
@@ -267,7 +267,7 @@ def evidence_of(
     runs, used, theta = [], [], fit.placed()
     for k, (e, y) in enumerate(zip(fit.experiments, predicted, strict=True)):
         x0 = record_start(model, e.record, fit.unknowns.start(theta, k))
-        errors = measured(e.record) - y
+        errors = e.record.measured - y
         inputs = sampled[k] if sampled else e.record
         used.append(errors[e.used])
         runs.append(
@@ -335,7 +335,7 @@ def _reference(model: Model, record: Record) -> ReferenceRun:
         stride *= 2
     kept = np.arange(0, min(record.n, _LONGEST * stride), stride)
     columns = {n: getattr(record, n, None) for n in model.input_names}
-    y = measured(record)[kept]
+    y = record.measured[kept]
     valid = np.isfinite(y)
     rounded = iter(_rounded(y[valid]))
     return ReferenceRun(

@@ -233,6 +233,17 @@ class Record(Signals):
         return np.isfinite(self.displacement)
 
     @property
+    def measured(self) -> FloatArray:
+        """The measured displacement [m].
+
+        Raises:
+            InputError: no displacement was measured.
+        """
+        if self.displacement is None:
+            raise InputError(f"Record '{self.name}' has no displacement; a fit compares with one.")
+        return self.displacement
+
+    @property
     def range_m(self) -> float:
         """Largest minus smallest displacement [m], or in counts where the record is in counts.
 

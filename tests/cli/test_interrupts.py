@@ -18,7 +18,6 @@ from psa_casadi.common.interruption import interruptible_work
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.result import DiagnosisInterrupted
 from psa_casadi.export.importer import masters
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.simulation.exact.run import run_exact
 from psa_casadi.simulation.side_by_side import VARIABLE, side_by_side
 from psa_casadi.simulation.simulate import input_samples
@@ -106,7 +105,7 @@ def test_a_diagnosis_keeps_the_best_model_so_far(
     model = stop.value.model
     assert model.provenance.interrupted
     assert len(model.effects) == effects
-    error = psa.simulate(model, TIME, VOLTAGE).displacement - measured(record)
+    error = psa.simulate(model, TIME, VOLTAGE).displacement - record.measured
     assert np.std(error) < 0.1 * record.range_m
     assert ("not judged" in str(stop.value)) == bool(effects)
 

@@ -14,7 +14,6 @@ from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.base_fit import from_resonances
 from psa_casadi.diagnosis.diagnose import diagnose
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.refitting import quick_rtol
 from psa_casadi.identification.search import fit_base
 from psa_casadi.identification.start.ordinary import starting_model
@@ -38,7 +37,7 @@ def test_the_order_of_the_records_does_not_matter(tmp_path: Path) -> None:
     effects = [psa.EFFECTS["offset_drift"]]
     one, other = (psa.diagnose(r, effects=effects) for r in (records, records[::-1]))
     for mine, yours in zip(one.experiments, other.experiments, strict=True):
-        np.testing.assert_array_equal(measured(mine.record), measured(yours.record))
+        np.testing.assert_array_equal(mine.record.measured, yours.record.measured)
     assert one.extended_errors == other.extended_errors
     assert one.causes == other.causes
 
@@ -63,7 +62,7 @@ def test_stuck_readings_that_the_misfit_hid_are_masked_once_the_cause_is_known(
     truth = make_record("mains_hum", 3, tmp_path / "a.csv", excitation="triangle", visible=3.0)
     inputs = psa.read_record(tmp_path / "a.csv").slice(0, 1200)
     counts = 0.7 * truth.sigma
-    y = counts * np.round(measured(inputs) / counts)
+    y = counts * np.round(inputs.measured / counts)
     moves = np.abs(np.diff(truth.displacement[:1200], prepend=0.0))
     stuck = []
     for k in range(100, 1100, 50):
@@ -106,6 +105,16 @@ def test_two_resonances_within_the_band_are_fitted_to_the_noise(tmp_path: Path) 
     tones = sorted([np.sqrt(stack.k_p / stack.m_p), np.sqrt(stack.k_b / stack.m_b)])
     mine = sorted([np.sqrt(p["k_P"] / p["m_P"]), np.sqrt(p["k_B"] / p["m_B"])])
     assert mine[0] == pytest.approx(tones[0], rel=0.1)
+
+
+@slow
+@pytest.mark.parametrize("samples", [60, 150, 250])
+def test_the_noise_of_a_short_record_is_as_large_as_it_is(samples: int, tmp_path: Path) -> None:
+    """All trial directions of the effects together explain most of so few samples."""
+    truth = make_record(None, 2, tmp_path / "a.csv", excitation="triangle")
+    result = psa.diagnose(psa.read_record(tmp_path / "a.csv").slice(0, samples))
+    assert result.verdict == "adequate"
+    assert result.noise_floor_rms_m == pytest.approx(truth.sigma, rel=0.15)
 
 
 @slow

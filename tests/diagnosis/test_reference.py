@@ -10,7 +10,6 @@ import psa_casadi as psa
 from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.reference import Healthy
 from psa_casadi.identification.fitting.fit import fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.split import whole
 from psa_casadi.report.words.verdict_words import verdict_sentence
 from tests.any_model.own_models import oven
@@ -54,7 +53,7 @@ def test_an_effect_is_named_next_to_a_hysteresis_that_the_base_lacks() -> None:
     assert codes(d)["since"].values["places"] == 1
     # the plant's form, not the package's, was added: its size is recovered as well
     more = 1e-6 * (play(CREEPS).clean - play(replace(CREEPS, hidden={})).clean)
-    left = measured(d.experiments[0].record) - d.base[0]
+    left = d.experiments[0].record.measured - d.base[0]
     assert np.corrcoef(more, left)[0, 1] > 0.9
 
 

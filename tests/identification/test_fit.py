@@ -10,7 +10,7 @@ import pytest
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.fit import FIT_RTOL, Fit, Objective, fit
-from psa_casadi.identification.fitting.prediction import Prediction, measured, motions_of, predict
+from psa_casadi.identification.fitting.prediction import Prediction, motions_of, predict
 from psa_casadi.identification.fitting.unknowns import Unknowns, unknowns_of
 from psa_casadi.identification.refitting import same_place
 from psa_casadi.identification.search import fit_base, free_parameters
@@ -301,7 +301,7 @@ def fitted_demo(experiments: list[Experiment], sigma: float, rtol: float = FIT_R
 
 
 def allowed(experiment: Experiment, sigma: float) -> float:
-    return max(0.03 * sigma, 1e-6 * float(np.ptp(measured(experiment.record)[experiment.used])))
+    return max(0.03 * sigma, 1e-6 * float(np.ptp(experiment.record.measured[experiment.used])))
 
 
 def test_a_fit_reports_way_and_error_of_each_record() -> None:

@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.noise import noise_floor
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records import Record, excitation
 from psa_casadi.records.noise_kinds import NoiseFound, NoiseKind, noise_kinds, notes_of
 from psa_casadi.records.repeats import MeasuredNoise, held, holds, repeats, repetitions
@@ -408,7 +407,7 @@ def test_the_noise_floor_takes_the_best_source() -> None:
     once = excitation.multisine(time, 0.0, 100.0, (0.05, 20.0), seed=1)
     rows = [(sine(v.size), 1e-7 * sine(v.size)), (v, creep), (once, 1e-7 * once)]
     records = [record(u, y + LEVEL * rng.standard_normal(u.size)) for u, y in rows]
-    residuals = [measured(r) - y for r, (_, y) in zip(records, rows, strict=True)]
+    residuals = [r.measured - y for r, (_, y) in zip(records, rows, strict=True)]
     floors = noise_floor(records, residuals)
     assert [f.source for f in floors] == ["repeats", "holds", "fast part"]
     for floor in floors:

@@ -14,7 +14,7 @@ from psa_casadi.diagnosis.misfit import Misfit, misfit
 from psa_casadi.diagnosis.noise import NoiseFloor, noise_floor
 from psa_casadi.diagnosis.remedy import Size
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import Simulated, measured
+from psa_casadi.identification.fitting.prediction import Simulated
 from psa_casadi.identification.fitting.unknowns import unknowns_of
 from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.model.variables import Interval, Provenance
@@ -45,7 +45,7 @@ def experiment(name: str, samples: int) -> tuple[Experiment, FloatArray, FloatAr
 def misfits(name: str, samples: int) -> tuple[NoiseFloor, Misfit, Misfit]:
     """Return the noise floor of a record, and what models without and with the drift leave."""
     e, clean, drifting = experiment(name, samples)
-    without, with_drift = (measured(e.record) - y for y in (clean, drifting))
+    without, with_drift = (e.record.measured - y for y in (clean, drifting))
     (floor,) = noise_floor([e.record], [with_drift])
     return floor, misfit(e.record, without, floor), misfit(e.record, with_drift, floor)
 
@@ -70,7 +70,7 @@ def periodic(counts: bool = False) -> tuple[Experiment, NoiseFloor, Misfit, Misf
 def with_periodic(d: result.StackDiagnosis, *, counts: bool = False) -> result.StackDiagnosis:
     """Return a diagnosis of one record with another in its place, of a periodic voltage."""
     e, floor, before, after = periodic(counts)
-    y = measured(e.record)
+    y = e.record.measured
     base = np.asarray((1e2 if counts else 1e-7) * e.record.voltage)
     return replace(d, experiments=(e,), noise=(floor,), misfit=(before,), remainder=(after,),
                    base=(base,), extended=(y,))  # fmt: skip

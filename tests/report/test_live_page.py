@@ -13,7 +13,6 @@ import pytest
 
 import psa_casadi as psa
 from psa_casadi.design.tracking.targets import respond
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.model.model_file import loads
 from psa_casadi.model.variables import Interval, Provenance
 from psa_casadi.report.page import live
@@ -54,8 +53,8 @@ def rms_of(d: psa.StackDiagnosis, values: dict[str, float]) -> float:
     trajectory = psa.simulate_record(
         model, e.record, fit.unknowns.start(fit.theta, 0), as_exported=False
     )
-    residual = measured(e.record) - trajectory.displacement
-    observed, center = np.isfinite(residual), (measured(e.record) - d.extended[0])
+    residual = e.record.measured - trajectory.displacement
+    observed, center = np.isfinite(residual), (e.record.measured - d.extended[0])
     use = observed & ~e.held_out
     residual += np.mean(center[use]) - np.mean(residual[use])
     return 1e9 * float(np.sqrt(np.mean(residual[observed & e.held_out] ** 2)))
@@ -139,7 +138,7 @@ def test_an_effect_that_is_switched_off_is_explained_at_the_error(
     assert "nothing is fitted again" not in statement[0]
     assert "With slow creep off nothing is fitted again: all other values were" in statement[1]
     e = case.experiments[0]
-    miss = (measured(e.record) - case.base[0])[e.held_out & np.isfinite(measured(e.record))]
+    miss = (e.record.measured - case.base[0])[e.held_out & np.isfinite(e.record.measured)]
     base = 1e9 * float(np.sqrt(np.mean(miss**2)))
     assert f"The base model, fitted without any effect, leaves {base:.3g} nm." in statement[1]
 

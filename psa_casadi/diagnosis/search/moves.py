@@ -12,7 +12,6 @@ from psa_casadi.diagnosis.search import fits
 from psa_casadi.diagnosis.search.hypothesis import Hypothesis, hypothesis
 from psa_casadi.diagnosis.search.state import FINALISTS, NEAR, SearchState, nearly
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.start.linear_response import MOST_DAMPED, Mode, Response, modes_of
 from psa_casadi.model.component import Component
 from psa_casadi.model.compose import Model
@@ -54,7 +53,7 @@ def with_modes(before: Hypothesis) -> Hypothesis | None:
             drive = _at_rest(before.fit.model, e.record, e.stop)
         except PsaError:
             return None
-        left = measured(e.record)[part] - before.predicted[k][part]
+        left = e.record.measured[part] - before.predicted[k][part]
         shaken.append(Response(e.record.sample_time, drive[part], left, e.used[part]))
         free.append(before.fit.jacobian[before.fit.parts[k]][first:last])
     modes = modes_of(shaken, np.vstack(free), most=MOST, better=_LOWERED) if shaken else []

@@ -11,7 +11,6 @@ from psa_casadi.export.common.parameter_sets import MOST_SAMPLES
 from psa_casadi.export.fmu import evidence as carried
 from psa_casadi.export.importer.archive import Archive
 from psa_casadi.export.importer.masters import Signals
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.prepare import as_read, prepared
 from psa_casadi.model.compose import Model
 from psa_casadi.model.evidence import RecordRun
@@ -106,6 +105,6 @@ def _of_record(
         Signals(tuple(inputs), times, np.array(list(inputs.values())).T),
         {n: v for n, v in run.start.items() if n in model.state_names},
         text if text in archive.names("output") else "displacement",
-        np.where(judged, measured(ready) - run.offset_m, np.nan),
+        np.where(judged, ready.measured - run.offset_m, np.nan),
         run.held_out_m if run.held_out else run.fitted_m,
     )

@@ -35,7 +35,6 @@ from psa_casadi.identification.fitting.prediction import (
     Prediction,
     Simulated,
     further_of,
-    measured,
     motions_of,
     predict,
     predicted_further,
@@ -581,7 +580,7 @@ def unknowns_around(
             model, free, [starts(e) for e in experiments],
             (span_of(experiments, 0) or 1.0) if offset else 0.0, np.inf if offset else 1.0,
         ).without([k for k, e in enumerate(experiments) if not e.at(0).any()])  # fmt: skip
-    scale = max(float(np.nanstd(measured(e.record)[e.used])) for e in fitted(experiments))
+    scale = max(float(np.nanstd(e.record.measured[e.used])) for e in fitted(experiments))
     motions = [motions_of(placed, e.record, s) for e, s in zip(experiments, sigma, strict=True)]
     first = [float(e.record.voltage[0]) for e in experiments]
     unknowns = unknowns_of(model, free, motions, first, 30.0 * max(scale, 1e-12))

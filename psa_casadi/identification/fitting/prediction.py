@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import Note, note
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting.unknowns import Unknowns
@@ -47,13 +46,6 @@ class Prediction:
     jacobian: FloatArray
     way: str
     further: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-
-
-def measured(record: Record) -> FloatArray:
-    """Return the measured displacement [m]; raises InputError when a record has none."""
-    if record.displacement is None:
-        raise InputError([f"Record '{record.name}' has no displacement; a fit compares with one."])
-    return record.displacement
 
 
 def predict_record(
@@ -138,7 +130,7 @@ def motions_of(model: Model, record: Record, noise: float) -> dict[str, float]:
     rates = np.zeros(u.shape[1])
     rates[column] = float(np.sqrt(np.mean((np.diff(v) / np.diff(record.time)) ** 2)))
     moving = start_state(model, list(u[0]), rates.tolist())
-    gain = float(np.nanstd(measured(record))) / max(float(np.std(v)), 1e-300)
+    gain = float(np.nanstd(record.measured)) / max(float(np.std(v)), 1e-300)
     if not gain * float(np.sqrt(np.mean(bend**2))) > 3.0 * noise:
         return {}
     memories = memory_names(model.structure)

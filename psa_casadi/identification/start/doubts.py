@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.units import BoolArray, FloatArray
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.records.drive import reversals
 from psa_casadi.records.record import FEWEST_SAMPLES, Record
 
@@ -35,7 +34,7 @@ def refuse_stuck(records: Sequence[Record]) -> None:
 def refuse_still(records: Sequence[Record]) -> None:
     """Raise InputError where displacements, as they were read, have one or two values."""
     for name, columns in (
-        ("displacement", [measured(r)[r.mask] for r in records]),
+        ("displacement", [r.measured[r.mask] for r in records]),
         ("voltage", [r.voltage for r in records]),
     ):
         largest = max(float(np.max(np.abs(c), initial=0.0)) for c in columns)
@@ -43,7 +42,7 @@ def refuse_still(records: Sequence[Record]) -> None:
             raise InputError(
                 f"The {name} reaches {largest:.2g}: that is no reading; correct the column."
             )
-    values = [np.unique(measured(r)[r.mask]) for r in records]
+    values = [np.unique(r.measured[r.mask]) for r in records]
     if all(v.size <= 1 for v in values):
         raise InputError(
             f"The displacement is {values[0][0]:.6g} m throughout: the sensor is out of its range"
@@ -69,7 +68,7 @@ def refuse_few(inputs: Sequence[Record], kept: Sequence[Record], texts: Sequence
             f" needs {FEWEST_SAMPLES}; record again, with the sensor in its range throughout."
         )
         raise InputError([*texts, few])
-    uniques = [np.unique(measured(r)[r.mask], return_counts=True) for r in kept if r.mask.any()]
+    uniques = [np.unique(r.measured[r.mask], return_counts=True) for r in kept if r.mask.any()]
     others = after - sum(int(counts.max()) for _, counts in uniques)
     if others < min(after, FEWEST_SAMPLES):
         values, counts = max(uniques, key=lambda u: int(u[1].max()))
@@ -138,7 +137,7 @@ def _faster(records: Sequence[Record], limit: float) -> str:
         if np.ptp(record.voltage) == 0.0:
             continue
         pace, _ = _paces(record)
-        y = measured(record)[record.mask]
+        y = record.measured[record.mask]
         if record.displacement_unit == "counts":
             stroke = _CHIP * float(np.ptp(record.voltage))
         else:
@@ -255,7 +254,7 @@ def doubtful_quantity(records: Sequence[Record]) -> str:
 
 def _readings(record: Record) -> tuple[FloatArray, FloatArray]:
     mask: BoolArray = record.mask
-    return measured(record)[mask], record.voltage[mask]
+    return record.measured[mask], record.voltage[mask]
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> float:
@@ -326,7 +325,7 @@ def stray(records: Sequence[Record]) -> list[str]:
     """Name the few samples of a record that lie far from all others, in voltage or displacement."""
     sentences = []
     for r in records:
-        columns = [("voltage", "V", r.voltage), ("displacement", "m", measured(r))]
+        columns = [("voltage", "V", r.voltage), ("displacement", "m", r.measured)]
         for name, unit, column in columns:
             far = _far(column)
             if not far.size:
@@ -360,7 +359,7 @@ def static_slope(records: Sequence[Record]) -> float:
     for record in records:
         valid = record.mask
         v = record.voltage[valid] - np.mean(record.voltage[valid])
-        y = measured(record)[valid]
+        y = record.measured[valid]
         top += float(v @ (y - np.mean(y)))
         bottom += float(v @ v)
     return top / bottom if bottom > 0 else 0.0
@@ -368,7 +367,7 @@ def static_slope(records: Sequence[Record]) -> float:
 
 def correlation(records: Sequence[Record]) -> float:
     """Correlation of displacement and voltage over all records, -1 to 1."""
-    spread = [float(np.nanvar(measured(r))) * r.n for r in records]
+    spread = [float(np.nanvar(r.measured)) * r.n for r in records]
     drive = [float(np.var(r.voltage)) * r.n for r in records]
     return static_slope(records) * float(np.sqrt(sum(drive) / max(sum(spread), 1e-300)))
 

@@ -24,7 +24,6 @@ import scipy
 from psa_casadi.common.errors import InputError
 from psa_casadi.common.notes import note, texts
 from psa_casadi.common.units import FloatArray
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.fitting.unknowns import static_compliance, within_bounds
 from psa_casadi.identification.start.doubts import (
     doubtful_unit,
@@ -429,7 +428,7 @@ def _rate(record: Record) -> float:
 def _loop(record: Record) -> _Loop:
     """Return a record, averaged in blocks if it has many samples; `rests` if it starts at 0 V."""
     valid = record.mask
-    y = np.interp(record.time, record.time[valid], measured(record)[valid])
+    y = np.interp(record.time, record.time[valid], record.measured[valid])
     every = -(-record.n // _SAMPLES)
     blocks = record.n // every
     t, u, x = (

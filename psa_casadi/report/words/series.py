@@ -10,7 +10,6 @@ import numpy.typing as npt
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.result import Candidate, Diagnosis, StackDiagnosis
 from psa_casadi.identification.experiments import varied
-from psa_casadi.identification.fitting.prediction import measured
 from psa_casadi.identification.identify import StackIdentification
 from psa_casadi.identification.result import Identification
 from psa_casadi.model.variables import NORMAL_95
@@ -152,7 +151,7 @@ def series_of_fit(identification: Identification) -> tuple[Series, ...]:
         predictions = identification.fit.predicted()
         rows_of = zip(identification.experiments, predictions, strict=True)
         for k, (e, predicted) in enumerate(rows_of):
-            noise = high_frequency_noise((measured(e.record) - predicted)[e.known])
+            noise = high_frequency_noise((e.record.measured - predicted)[e.known])
             rows.append(_displacement(k, e, [Curve("model", colours.EXTENDED, predicted)], noise))
         return tuple(rows)
     outputs = identification.fit.outputs()
@@ -169,7 +168,7 @@ def _displacement(k: int, e: Experiment, curves: Sequence[Curve], noise: float) 
         name=e.record.name,
         time=e.record.time,
         voltage=e.record.voltage,
-        measured=measured(e.record),
+        measured=e.record.measured,
         curves=tuple(curves),
         held_out=e.held_out,
         noise=noise,

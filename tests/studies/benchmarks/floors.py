@@ -23,7 +23,6 @@ import psa_casadi as psa
 from psa_casadi import datasets
 from psa_casadi.common.units import BoolArray, FloatArray, IndexArray
 from psa_casadi.diagnosis.held_out import Errors, errors_of
-from psa_casadi.identification.fitting.prediction import measured as readings
 from psa_casadi.records.split import Experiment
 from psa_casadi.report.plots.figures import narrow_figure
 from tests.studies.benchmarks.table import Outcome, Progress, TitledTable
@@ -72,7 +71,7 @@ def floor_on(experiments: Sequence[Experiment], progress: Progress) -> Errors:
     middle, half = 0.5 * (voltages.max() + voltages.min()), 0.5 * float(np.ptp(voltages))
     size = max(e.record.range_m for e in experiments)
     parts = [
-        Part((e.record.voltage - middle) / half, readings(e.record) / size, e.used)
+        Part((e.record.voltage - middle) / half, e.record.measured / size, e.used)
         for e in experiments
     ]
     return errors_of(experiments, [size * y for y in floor_of(parts, progress).predicted])
