@@ -77,6 +77,9 @@ def exchanges(p: Values) -> Iterator[tuple[str, dict[str, float]]]:
 
 #: Parameters that only fast records determine: each is freed if the data determine it.
 FAST = ("m_P", "m_B", "m", "k_P")
+#: A resonance beyond this many times the sampling rate adds (0.5/10)^2 = 1/400 to what moves at
+#: half of it: a free mass would follow a misfit, to where its ringing is sampled as a slow motion.
+_BEYOND = 10.0
 #: Without this relative standard error k_P stays where it is: it would only blur every force.
 _SHARP = 0.1
 #: Evaluations of a fit with fast parameters, and from exchanged values, first and then to the end;
@@ -85,19 +88,34 @@ _WIDER, _FIRST, _LAST, _ROUNDS, _HOPEFUL = 40, 5, 30, 3, 2.0
 
 
 def with_fast(best: Fit, progress: Progress) -> Fit:
-    """Free the fast parameters that these records determine, if that lowers the cost clearly."""
+    """Free the fast parameters that these records determine, if that lowers the cost clearly.
+
+    Not a mass whose resonance is beyond what they show.
+    """
     free = best.unknowns.names
     available = [n for n in FAST if n in best.model.values and n not in (*free, "k_P")]
     more = [n for n in available if _would_determine(best, n)]
-    if not more:
-        return best
-    progress(f"base fit with {', '.join(more)}")
-    try:
-        wider = refit(best, [*free, *more], sigma=best.sigma, evaluations=_WIDER)
-    except PsaError:
+    while more:
+        progress(f"base fit with {', '.join(more)}")
+        try:
+            wider = refit(best, [*free, *more], sigma=best.sigma, evaluations=_WIDER)
+        except PsaError:
+            return best
+        shown = [n for n in more if not _is_beyond(wider, n)]
+        if shown == more or wider.interrupted:
+            break
+        more = shown
+    else:
         return best
     needed = len(more) * np.log(len(best.residuals))
     return wider if wider.interrupted or wider.data_cost < best.data_cost - needed else best
+
+
+def _is_beyond(fit: Fit, mass: str) -> bool:
+    """Whether the resonance of a mass is too fast to show in the records."""
+    p, fastest = fit.model.values, min(e.record.sample_time for e in fitted(fit.experiments))
+    tone = np.sqrt(p[mass.replace("m", "k")] / p[mass]) / (2.0 * np.pi)
+    return bool(tone * fastest > _BEYOND)
 
 
 def without_blur(best: Fit) -> Fit:

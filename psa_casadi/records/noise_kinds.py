@@ -319,26 +319,34 @@ class _Residual:
         return tuple(self.time[self.index[places[:3]]].tolist())
 
     def _with_drive(self, places: IndexArray) -> bool:
-        """Whether places sit at turns, values or rates of the input, as a misfit's do.
+        """Whether places sit at steps, turns, values or rates of the input, as a misfit's do.
 
-        By the binomial distribution of how many are at turns, and by Pearson's chi-square test of
-        how many lie in each eighth of all values.
+        By how many samples are as near to so large a rate as all of them, by the binomial
+        distribution of how many are at turns, and by Pearson's chi-square test of how many lie in
+        each eighth of all values.
         """
-        if not self.inputs or places.size <= _FEW:
+        if not self.inputs:
             return False
         values = self.inputs[0][self.index]
+        largest = scipy.ndimage.maximum_filter1d(np.abs(np.diff(values, prepend=values[0])), 3)
+        at_steps = float(np.mean(largest >= np.min(largest[places]))) ** places.size
+        if places.size <= _FEW:
+            return at_steps < _NO_CHANCE
         turns = reversals(values, _TURN * float(np.ptp(values)))
         near = np.zeros(values.size, dtype=np.bool_)
         near[np.clip(turns[:, None] + np.arange(-_NEAR, _NEAR + 1), 0, values.size - 1)] = True
         hits = int(np.count_nonzero(near[places]))
-        chances = [scipy.special.bdtrc(hits - 1, places.size, float(near.mean()))] if hits else []
+        chances = [at_steps]
+        if hits:
+            at_turns = scipy.special.bdtrc(hits - 1, places.size, float(near.mean()))
+            chances.append(float(at_turns))
         rate, away = np.gradient(values), np.abs(values - 0.5 * (values.min() + values.max()))
         for x in (values, away, rate, np.abs(rate)):
             bins = np.searchsorted(np.quantile(x, np.arange(1, 8) / 8.0), x)
             expected = np.bincount(bins) * (places.size / x.size)
             excess = np.bincount(bins[places], minlength=expected.size) - expected
             apart = excess[expected > 0.0] ** 2 / expected[expected > 0.0]
-            chances.append(scipy.special.chdtrc(max(apart.size - 1, 1), float(apart.sum())))
+            chances.append(float(scipy.special.chdtrc(max(apart.size - 1, 1), apart.sum())))
         return bool(min(chances) < _NO_CHANCE)
 
     def _innovations(self, white: FloatArray, whole: bool, spikes: BoolArray) -> list[NoiseKind]:

@@ -7,12 +7,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from psa_casadi.common.units import FloatArray
 from psa_casadi.identification.fitting import fit as fitting
 from psa_casadi.identification.identify import StackIdentification, identify
 from psa_casadi.identification.mechanics import exchanges
+from psa_casadi.identification.search import fit_base
+from psa_casadi.identification.start.ordinary import starting_model
 from psa_casadi.records import Record
+from psa_casadi.records.split import split
 from tests.model.stack_models import stack_values
 from tests.studies.benchmarks.coverage import one_run
 from tests.studies.benchmarks.records import clean_loops, with_noise
@@ -34,6 +38,24 @@ def test_a_stack_is_identified_from_its_records_alone() -> None:
         assert table[name_of].value == pytest.approx(table[name_of].truth, rel=limit), name_of
     assert sum(not q.covered for q in table.values()) <= 2
     assert all(q.errors_off < 4.5 for q in table.values())
+
+
+def test_no_resonance_beyond_a_record_follows_its_creep() -> None:
+    """Steps at 1 kHz, creep that the base lacks: masses free at 16 kHz, they ended at 1.0 kHz."""
+    time = 1e-3 * np.arange(3000.0)
+    voltage = np.where(time < 1.5, 60.0 * (1.0 - np.cos(4.0 * np.pi * time)), 80.0)
+    voltage[time > 2.2] = 30.0
+    hysteresis = [0.0]
+    for change in np.diff(voltage):
+        h = hysteresis[-1]
+        hysteresis.append(h + 0.25 * change - 0.02 * abs(change) * h - 0.005 * change * abs(h))
+    x = 9.5e-8 * (voltage - hysteresis)
+    decays = np.exp(-1e-3 / np.array([0.05, 0.2, 0.8, 3.2]))
+    x += 0.02 * sum(lfilter([1.0 - q], [1.0, -q], x) for q in decays)
+    x += 8e-9 * np.random.default_rng(0).standard_normal(x.size)
+    record = Record(name="steps", time=time, voltage=voltage, displacement=x)
+    base = fit_base(starting_model([record], None), (split(record),))
+    assert not {"m_P", "m_B"} & set(base.unknowns.names)
 
 
 def test_exchanging_twice_changes_nothing() -> None:

@@ -188,6 +188,17 @@ def test_what_returns_at_once_is_no_step(seed: int) -> None:
     assert "steps" not in {k.kind for k in kinds_in(short_step, fading, seed)}
 
 
+@pytest.mark.parametrize("places", [(3000,), (1500, 3000, 4500)])
+def test_jumps_at_steps_of_the_voltage_are_no_noise(places: tuple[int, ...]) -> None:
+    """A model that misses what follows a step leaves a residual that jumps there."""
+    rng = np.random.default_rng(3)
+    levels = [np.searchsorted(np.add(places, k), np.arange(N), side="right") for k in (0, 300)]
+    u = fading(rng) + 20.0 * levels[0]
+    y = motion(u)
+    readings = [y + SIZE * (5.0 * jumps + rng.standard_normal(N)) for jumps in levels]
+    assert ["steps" in named(noise_kinds(TIME, r, y, [u])) for r in readings] == [False, True]
+
+
 def test_figures_are_those_of_the_noise() -> None:
     def figures(kind: str, seed: int) -> NoiseKind:
         kinds = kinds_in(KINDS[kind], fading, seed)
