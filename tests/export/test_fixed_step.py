@@ -295,6 +295,16 @@ def test_feed_forward_and_observer_are_the_python_objects(precision: str) -> Non
         assert np.abs(result - expected).max() <= ROUNDING[precision] * np.ptp(expected)
 
 
+@pytest.mark.parametrize("stack", ["P-885.51", "PTBS200"])
+def test_a_place_that_rests_but_for_its_last_digits_keeps_its_voltage(stack: str) -> None:
+    """With delta < 0 a voltage that creeps on solves the same equation of the next instant."""
+    forward = psa.FeedForward(psa.stack_values(psa.stack_model(stack), PERIOD))
+    path = np.minimum(2e-7 * np.arange(300), 1e-5)
+    path *= 1.0 + 1e-12 * np.random.default_rng(0).standard_normal(path.size)
+    volts = np.array([forward.step(w) for w in path.tolist()])
+    assert np.ptp(volts[60:]) < 1e-6 * np.ptp(volts)
+
+
 @cache
 def closed_loop() -> tuple[psa.AdaptiveFeedForward, FloatArray, FloatArray]:
     """Return a tracked feed-forward that has run, its inputs (n, 2) and its voltages (n,)."""

@@ -117,13 +117,16 @@ def swept_over(
 
 
 def stages(
-    c: Constants, theta: Sequence[Expression], f: Expression, last: Expression, u: Expression
-) -> tuple[Expression, Expression, Expression]:
+    c: Constants, theta: Sequence[Expression], f: Expression, last: Expression, u: Expression,
+    held: Expression | None = None,
+) -> tuple[Expression, Expression, Expression]:  # fmt: skip
     """Return the two stages of the step of f, of which the second is its end, and df/du there.
 
-    The derivative is that before the last Newton step towards each stage.
+    The derivative is that before the last Newton step towards each stage, without that of `held`,
+    the integral of u sgn(u'), which follows from u if it is not given.
     """
-    du, swept, held, _ = swept_over(c, last, u)
+    du, swept, following, _ = swept_over(c, last, u)
+    held = following if held is None else held
     free = theta[0] * du + theta[3] * held
 
     def solved(known: Expression) -> tuple[Expression, Expression, Expression]:
@@ -161,19 +164,20 @@ def force_after(
 def linearising_voltage(
     c: Constants, theta: Sequence[Expression], f: Expression, last: Expression, guess: Expression,
     force: Expression,
-) -> Expression:  # fmt: skip
-    """Return the next voltage u [V] at which k_L u + f_H(u) is the wanted force [N] (eqs. 39-41).
+) -> tuple[Expression, Expression]:  # fmt: skip
+    """Return the next voltage u [V] at which k_L u + f_H(u) is the wanted force [N], and f_H there.
 
-    The paper subtracts the observed force of the moment; here it is that of the next instant, so
+    Eqs. (39) to (41). The paper subtracts the observed force of the moment; here it is that of the next instant, so
     that no sample is lost. From `guess`, Newton's steps, which are enough for a jump across the
-    range: the slope only grows along the way from a turn.
+    range: the slope only grows along the way from a turn. sgn(u') is that on the way to `guess`:
+    with delta < 0 a voltage that creeps on solves the equation of a place at rest, too.
     """
-    u = guess
+    u, held = guess, swept_over(c, last, guess)[2]
     for _ in range(_OUTER):
-        _, end, by_u = stages(c, theta, f, last, u)
+        _, end, by_u = stages(c, theta, f, last, u, held)
         slope = ca.fmax(theta[5] + by_u, _LEAST_SLOPE * theta[5])
         u -= (theta[5] * u + end - force) / slope
-    return u
+    return u, stages(c, theta, f, last, u, held)[1]
 
 
 #: Deviations stay within this many spreads; the bend n stays above its least value.
@@ -432,8 +436,8 @@ def _constants(s: Symbols, parameters: tuple[Parameter, ...]) -> Constants:
 
 def _next_voltage(
     c: Constants, s: Symbols, theta: list[Expression], force: Expression, last: Expression
-) -> Expression:
-    """Return the voltage at the next instant, from the force and the voltage at the last one."""
+) -> tuple[Expression, Expression]:
+    """Return voltage and force at the next instant, from the force and the voltage at the last."""
     guess = last + (s.wanted - s.wanted_last) * s.stiffness / s.k_L
     return linearising_voltage(c, theta, force, last, guess, s.stiffness * s.wanted)
 
@@ -471,8 +475,7 @@ def hysteresis_observer(s: Symbols) -> Equations:
 def feed_forward(s: Symbols) -> Equations:
     """Voltage for a wanted displacement of a stack, its hysteresis taken off, sampled."""
     c = _constants(s, _OBSERVING)
-    u = _next_voltage(c, s, list(c.start), s.f_H, s.u_last)
-    force = force_after(c, c.start, s.f_H, s.u_last, u)
+    u, force = _next_voltage(c, s, list(c.start), s.f_H, s.u_last)
     return Equations(
         next={"u_last": u, "f_H": force, "wanted_last": s.wanted},
         out={"voltage": s.u_last, "hysteresis_force": s.f_H},
@@ -499,7 +502,7 @@ def adaptive_feed_forward(s: Symbols) -> Equations:
     """The voltage that was returned last has been applied when the displacement is measured."""
     c = _constants(s, online_identification.parameters)
     _, after, learning, _ = _learnt(s, c, s.applied)
-    u = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
+    u, _ = _next_voltage(c, s, estimates(c, after.z), after.f, after.u)
     return Equations(
         next={**learning.next, "applied": u, "wanted_last": s.wanted},
         out={"voltage": s.applied, **learning.out},
