@@ -114,14 +114,22 @@ def _own(work: Callable[..., Any], model: Model, records: Any, words: dict[str, 
     return work(model, records, **_known(words, work))
 
 
+#: Words that are several names.
+_NAMES = ("free", "zeros", "leave_out")
+
+
 def _known(words: dict[str, Any], work: Callable[..., Any]) -> dict[str, Any]:
-    """Return the words for a piece of work. Raises InputError for one that it does not take."""
+    """Return the words for a piece of work, one name in the place of several as a list of it.
+
+    Raises InputError for a word that it does not take.
+    """
     names = [n for n in signature(work).parameters if n not in ("model", "records")]
     for word in words:
         if word not in names:
             what = "your model" if "known_start" in names else "a stack"
             raise InputError(f"'{word}' is not among the arguments for {what}: {', '.join(names)}.")
-    return words
+    single = {n: [w] for n, w in words.items() if n in _NAMES and isinstance(w, str)}
+    return words | single
 
 
 def _models_first(inputs: tuple[Any, ...], words: dict[str, Any]) -> tuple[Model | None, Any]:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import psa_casadi as psa
-from psa_casadi.cli.inputs import Fitting, Inputs, own_model
+from psa_casadi.cli.inputs import PAGE, Fitting, Inputs, own_model
 from psa_casadi.cli.options import Hysteresis, Reading
 from psa_casadi.cli.screen import show, show_results, show_written, working
 
@@ -121,7 +121,7 @@ def compare(files: list[Path], *, output: Path = Path("compare.html"), inputs: I
     from psa_casadi.report.words.tables import Table
 
     tables: tuple[Table, ...] = ()
-    inputs.outputs({"--output": output}, files, page="--output")
+    inputs.outputs({"--output": output}, files, PAGE)
     inputs.check()
     with working("comparing"):
         if len(files) == 1 and files[0].is_dir():

@@ -77,7 +77,8 @@ def diagnose(
         events: File that gets a line of JSON for every fit of the search while it runs: its causes,
             evidence, score and errors.
         expect: Verdicts of which one must come out, with commas between, else exit code 1:
-            adequate, cause_named, partly_explained, ambiguous, unexplained, not_driven.
+            adequate, cause_named, partly_explained, ambiguous, unexplained, not_driven. One that
+            held-out samples cannot confirm is not adequate.
         max_error: Largest held-out error of the extended model, in % of the range, as 0.5%, else
             exit code 1.
 

@@ -138,7 +138,10 @@ def expected(
 def cases(d: result.Diagnosis, wanted: tuple[str, ...], max_error: float | None) -> list[Case]:
     """Return verdict and largest held-out error of the extended model as tests, failed or not."""
     wrong = f"The verdict is {d.verdict}; expected {listing(wanted, 'or')}."
-    failed = bool(wanted) and d.verdict not in wanted
+    unconfirmed = d.verdict == "adequate" and d.doubt
+    if unconfirmed:
+        wrong = f"The verdict is adequate, but not confirmed: {d.doubt}."
+    failed = bool(wanted) and (d.verdict not in wanted or bool(unconfirmed))
     verdict = Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong if failed else "")
     large, shares = "", of_range(d, extended=True)
     worst = max(shares, key=lambda output: shares[output])

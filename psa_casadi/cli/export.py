@@ -152,7 +152,7 @@ def fmu(
     from psa_casadi.export.fmu.sources import FIXED_ENTRY
     from psa_casadi.simulation.compiler import INSTALL_ZIG, has_zig
 
-    inputs.outputs({"--output": output}, [model])
+    inputs.outputs({"--output": output}, [model], ("an FMU", ".fmu"))
     if sets_to is not None and sets_to.exists() and not sets_to.is_dir():
         inputs.add(f"{sets_to}: is a file; name a folder for the parameter sets.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
@@ -286,7 +286,8 @@ def ssp(
     from psa_casadi.export.fmu.platforms import chosen_platforms
     from psa_casadi.export.ssp import OUTSIDE, Port, layout_of, save_wiring, stable_step, wiring_of
 
-    inputs.outputs({"--output": output, "--picture": picture}, [model])
+    files = {"--output": output, "--picture": picture}
+    inputs.outputs(files, [model], ("an SSP archive", ".ssp"))
     if picture is not None and picture.suffix.lower() not in (".svg", ".png"):
         inputs.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]

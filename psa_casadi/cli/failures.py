@@ -21,7 +21,7 @@ from typing import Any, NoReturn, ParamSpec
 import typer
 
 from psa_casadi.cli import INTERRUPTED
-from psa_casadi.cli.screen import print_message
+from psa_casadi.cli.screen import print_message, show_written
 from psa_casadi.common.cache import sweep_rooms
 from psa_casadi.common.characters import plain
 from psa_casadi.common.errors import InputError, MachineError, PsaError
@@ -325,6 +325,7 @@ def judge(
     """
     if junit is not None:
         atomic_write(junit, junit_text(command, subject, cases, time.perf_counter() - began))
+        show_written(junit)
     failures = [case.failure for case in cases if case.failure]
     for failure in failures if show_failures else ():
         print_message(f"Not as expected: {failure}")

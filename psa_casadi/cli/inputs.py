@@ -4,6 +4,7 @@ Also `--model` that is no stack: a function of a Python file, an FMU, the file o
 """
 
 import difflib
+import math
 import os
 import re
 import runpy
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 #: What an option writes, and what the names of such files end with.
-_PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
+PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
 
 
 @dataclass(kw_only=True)
@@ -152,7 +153,7 @@ class Inputs:
             numbers: tuple[float, ...] = ()
             with suppress(ValueError):
                 numbers = tuple(float(figure) for figure in figures.split(":"))
-            if len(numbers) in counts:
+            if len(numbers) in counts and not any(map(math.isnan, numbers)):
                 values[name.strip()] = numbers
             else:
                 self.add(f"{option} is '{text}'; give {form}.")
@@ -260,13 +261,14 @@ class Inputs:
         self,
         named: Mapping[str, Path | None],
         inputs: Sequence[Path | None],
-        page: str = "--report",
+        output: tuple[str, ...] = ("",),
     ) -> None:
         """Demand that every output can be written, and that no two are one file or an input.
 
-        Where the names of the `page` and of a picture have an ending, it is one of theirs.
+        Where the name of a page or a picture has an ending, it is one of theirs; so is that of the
+        `output`: what it is, and its endings.
         """
-        endings = {page: _PAGE, "--figure": _PICTURE}
+        endings = {"--report": PAGE, "--figure": _PICTURE, "--output": output}
         sources = {p.resolve() for p in inputs if p is not None}
         taken: dict[Path, str] = {}
         for option, path in named.items():
@@ -432,9 +434,10 @@ def from_python(path: Path) -> "psa.Model | None":
         ) from error
     if not isinstance(model, psa.Model):
         functions = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
+        near = [*difflib.get_close_matches(name, functions, 1), *functions[::-1], "make"][0]
         known = f"; it has {quoted(functions)}" if functions else ""
         lacks = f"{file} has no function '{name}' that returns a model{known}. Name one that does"
         if not name:
             lacks = f"say which function of {file} returns the model{known}"
-        raise InputError(f"--model: {lacks}, as {file}:{functions[-1] if functions else 'make'}.")
+        raise InputError(f"--model: {lacks}, as {file}:{near}.")
     return model

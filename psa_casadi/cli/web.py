@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from psa_casadi.cli.inputs import Fitting, Inputs, own_model
+from psa_casadi.cli.inputs import PAGE, Fitting, Inputs, own_model
 from psa_casadi.cli.options import StackName
 from psa_casadi.cli.screen import print_message, show_always, show_written, working
 from psa_casadi.common.errors import InputError
@@ -73,7 +73,7 @@ def web(
         inputs.add("--port and --no-browser are of --diagnose; add that, or leave them out.")
     if fitting != Fitting():
         inputs.add("your model is for --diagnose; add that.")
-    inputs.outputs({"--output": path}, [model], page="--output")
+    inputs.outputs({"--output": path}, [model], PAGE)
     chosen = inputs.model_or_stack(model, stack, needed=False)
     inputs.check()
     with working("compiling"):

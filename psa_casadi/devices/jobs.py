@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field, replace
 from datetime import date, datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from psa_casadi.common.characters import plain
 from psa_casadi.common.errors import InputError, Problems
@@ -226,6 +226,12 @@ class Options:
     sample_time: float | None = None
     modules: tuple[str, ...] = ()
     words: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Demand a known work. Raises InputError."""
+        if self.work not in get_args(Work):
+            known = " or ".join(f"'{w}'" for w in get_args(Work))
+            raise InputError(f"`work` is '{self.work}'; give {known}.")
 
 
 @dataclass(frozen=True)

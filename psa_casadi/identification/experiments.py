@@ -84,9 +84,9 @@ def experiments_of(
         )
         alone = [replace(e, channels=(channel,)) for e in result]
         readings = np.concatenate([e.measured(0)[e.at(0)] for e in alone])
-        spread = float(np.std(readings)) if readings.size else 0.0
-        if spread > 0.0:
-            channels.append(replace(channel, level=_FIRST_LEVEL * spread))
+        if readings.size and np.ptp(readings) > 0.0:
+            level = _FIRST_LEVEL * float(np.std(readings))
+            channels.append(replace(channel, level=level))
     if not channels:
         raise InputError("No output moves in these records; there is nothing to fit.")
     return tuple(replace(e, channels=tuple(channels)) for e in result)

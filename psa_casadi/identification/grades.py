@@ -59,7 +59,7 @@ def determined(model: Model, identification: StackIdentification | None = None) 
     """Return the parameters that the records determine, if only weakly.
 
     Without an identification they are those whose 95 % interval is that of a
-    standard error below `DETERMINED_WIDTH`.
+    standard error below `DETERMINED_WIDTH`, over the value or an ordinary change.
     """
     if identification is not None:
         known = {g.name for g in grades(identification) if g.degree in ("determined", "weak")}
@@ -70,7 +70,8 @@ def determined(model: Model, identification: StackIdentification | None = None) 
         if parameter.log:
             width = math.log(interval.high / interval.low) if interval.low > 0.0 else math.inf
         else:
-            width = (interval.high - interval.low) / (parameter.typical(model.values) or math.inf)
+            size = max(parameter.typical(model.values), abs(model.values[name]))
+            width = (interval.high - interval.low) / size
         if width <= 2.0 * NORMAL_95 * DETERMINED_WIDTH:
             narrow.add(name)
     return frozenset(narrow)

@@ -249,7 +249,10 @@ def _check_values(structure: Structure, values: Mapping[str, float]) -> None:
             problems.append(f"The model has no parameter '{name}'; it has {quoted(sorted(known))}.")
             continue
         low, high = known[name].bounds
-        if not low <= value <= high:
+        if low > high or (known[name].log and low < 0.0):
+            what = "are reversed" if low > high else "are negative, with log=True"
+            problems.append(f"The bounds ({low:g}, {high:g}) of '{name}' {what}; correct them.")
+        elif not low <= value <= high:
             problems.append(
                 f"Parameter '{name}' is {value:g} {known[name].unit}, outside its bounds"
                 f" [{low:g}, {high:g}]; choose a value inside."

@@ -399,6 +399,8 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
             psa.identify(oscillator(), inputs)
     with pytest.raises(psa.InputError, match=r"no output of the model 'oscillator'"):
         psa.diagnose(oscillator(), {"time": t, "force": t})
+    with pytest.raises(psa.InputError, match="No output moves"):
+        psa.diagnose(oscillator(), {"time": t, "force": t, "position": np.full(50, 0.2)})
     with pytest.raises(psa.InputError, match=r"model comes first.*psa.diagnose\(model, records\)"):
         psa.diagnose({"time": t, "force": t, "position": t}, oscillator())  # type: ignore[call-overload]
     with pytest.raises(psa.InputError, match=r"describes a diagnosis, and this is of type Signals"):
@@ -409,7 +411,7 @@ def test_records_that_do_not_fit_are_refused_in_sentences() -> None:
         psa.diagnose(
             oscillator(),
             {"time": t, "force": t, "position": t**2},
-            leave_out=["zero_off"],
+            leave_out="zero_off",
             starts=1,
         )
 

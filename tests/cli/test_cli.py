@@ -81,6 +81,27 @@ def test_the_playground_and_a_posterior_take_a_model(
     assert "The model is missing; add --model MODEL.json" in without.err
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["export", "fmu", "--stack", "demo", "-o", "a.csv"], "--output writes an FMU, .fmu"),
+        (["export", "ssp", "--stack", "demo", "-o", "a.csv"], "--output writes an SSP archive"),
+        (["linearize", "--stack", "demo", "--at", "voltage=nan"], "--at is 'voltage=nan'; give"),
+        (["diagnose", "a.csv", "--model", "a.py:mak"], "one that does, as a.py:make."),
+    ],
+)
+def test_mistakes_end_in_a_sentence_and_leave_files(
+    words: list[str | Path], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record = write(tmp_path / "a.csv", HEADER, *ROWS)
+    before = record.read_bytes()
+    write(tmp_path / "a.py", "def make(): ...", "def data(): ...")
+    ended = command(*words)
+    assert (ended.code, message in ended.words) == (2, True), ended.words
+    assert record.read_bytes() == before
+
+
 def test_an_identification_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(identify, "identify", lambda *_, **__: identification())
     monkeypatch.chdir(tmp_path)

@@ -261,6 +261,15 @@ def test_an_unusable_record_fails_a_test_and_leaves_other_files(tmp_path: Path) 
         assert "there is no such file" in results.read_text(encoding="utf-8")
 
 
+def test_what_too_few_samples_judge_is_not_adequate(tmp_path: Path) -> None:
+    columns = {name: values[:40] for name, values in table(DATA / "demo.csv").items()}
+    write(tmp_path / "a.csv", columns)
+    files = tmp_path / "a.csv", "--json", tmp_path / "d.json"
+    ended = command("diagnose", *files, "--expect", "adequate")
+    assert (ended.code, read(tmp_path / "d.json", "diagnosis")["verdict"]) == (1, "adequate")
+    assert "The verdict is adequate, but not confirmed: only" in ended.words
+
+
 def test_a_model_with_a_value_on_its_bound_hides_no_cause(demo: Demo, tmp_path: Path) -> None:
     """The base fit imitates creep by a damping at its bound; the diagnosis starts elsewhere."""
     model = demo.folder / "model.json"

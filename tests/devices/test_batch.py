@@ -177,6 +177,8 @@ def test_what_failed_is_tried_again_and_what_was_refused_is_not(
         assert texts == ["d1"]
         psa.batch(jobs, tmp_path / "out", executor=pool, options=psa.Options(stiffness=5e7))
     assert sorted(texts) == ["d0", "d1", "d1", "d2"]
+    with pytest.raises(psa.InputError, match="give 'identify' or 'diagnose'"):
+        psa.Options(work="diagnos")  # type: ignore[arg-type]
 
 
 def identified(task: DeviceTask) -> DeviceOutcome:

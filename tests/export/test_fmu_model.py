@@ -110,7 +110,8 @@ def test_an_exported_model_is_the_same_model(tmp_path: Path) -> None:
         {"x": x, "u": u, "p": k, "ode": k * (u - x**3), "y": x + u}, name="cubic", parameters=[k_]
     )
     path = psa.export_fmu(cubic, tmp_path / "cubic.fmu", fmi=3)
-    there = psa.fmu_model(path, free=["k"])
+    there = psa.fmu_model(path)
+    assert dict(there.values) == {"k": 3.0}
     u_: FloatArray = np.sin(np.arange(300) * 0.1)[:, None]
 
     def run(model: psa.Model) -> FloatArray:

@@ -9,6 +9,7 @@ import pytest
 
 import psa_casadi as psa
 from tests.contract.helpers import command
+from tests.export.fmu_models import rewritten
 from tests.export.supplied import compiled_fmu, supplied
 from tests.tiers import slow_but
 
@@ -49,6 +50,15 @@ def test_an_fmu_without_a_fault_passes() -> None:
     assert {"units defined", "speed", "step sizes"} <= notes <= {
         "units defined", "speed", "step sizes", "memory", "same bits again",
     }  # fmt: skip
+
+
+def test_the_unit_of_a_type_must_be_defined(tmp_path: Path) -> None:
+    typed = b'<TypeDefinitions><SimpleType name="t"><Real unit="ell"/></SimpleType>'
+    typed += b"</TypeDefinitions><ModelVariables>"
+    changes = {"modelDescription.xml": lambda text: text.replace(b"<ModelVariables>", typed)}
+    rows = psa.check_fmu(rewritten(faulty(0), tmp_path / "a.fmu", changes)).failures
+    remarks = {r.name: r.remark for r in rows}
+    assert remarks["units defined"].startswith("the unit 'ell' is not defined")
 
 
 @pytest.mark.parametrize("number", slow_but([1, 8], FAULTS))

@@ -337,7 +337,7 @@ HOSTILE: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "no word": (lambda m: entry(m).update(belongs_to={}), "give one of 'plant', 'drive'"),
     "a size": (lambda m: entry(m)["states"][0].update(nominal=None), "give a number"),
-    "bounds": (lambda m: entry(m)["parameters"][0].update(bounds=[5, 1]), "outside its bounds"),
+    "bounds": (lambda m: entry(m)["parameters"][0].update(bounds=[5, 1]), "are reversed"),
     "too much": (
         lambda m: entry(m).update(states=entry(m)["states"] * 2_000),
         "have 4007 variables, of which",

@@ -241,6 +241,10 @@ WRONG: dict[str, tuple[Callable[[], Any], dict[str, Any], str]] = {
     "out of bounds": (
         lambda: {"x": X, "p": K, "ode": X},
         {"parameters": [psa.Parameter("k", 2.0, "1", (0.0, 1.0), "k")]}, "outside its bounds"),
+    "no decades": (
+        lambda: {"x": X, "p": K, "ode": X},
+        {"parameters": [psa.Parameter("k", 2.0, "1", (-1.0, 9.0), "k", log=True)]},
+        "with log=True"),
     "name clash": (
         lambda: {"x": X, "ode": X, "y": X}, {"outputs": ["x"]}, "Two variables are named 'x'"),
     "not an identifier": (lambda: {"x": X, "ode": X}, {"states": ["x 1"]}, "cannot name a var"),

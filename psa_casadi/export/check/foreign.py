@@ -46,11 +46,12 @@ _ROUNDING, _SINGLE = 1e-9, 1e-6
 
 
 def units(archive: Archive) -> Findings:
-    """Every unit that a variable has is defined; a note has how many numbers have none."""
+    """Every unit of a variable or a type is defined; a note has how many numbers have none."""
     description = archive.description
     known = {u.name for u in description.unitDefinitions}
     stated = {v.name: v.unit for v in description.modelVariables if v.unit}
-    yield from (f"the unit '{u}' is not defined" for u in sorted({*stated.values()} - known))
+    used = {*stated.values(), *(t.unit for t in description.typeDefinitions if t.unit)}
+    yield from (f"the unit '{u}' is not defined" for u in sorted(used - known))
     without = [n for n, e in archive.elements.items() if e.real and e.variable not in stated]
     if without:
         yield Remark(f"{len(without)} of {len(archive.elements)} numbers have no unit")

@@ -15,6 +15,7 @@ import numpy as np
 
 from psa_casadi.common.errors import InputError, Problems, PsaError, quoted
 from psa_casadi.common.units import parse_unit
+from psa_casadi.export.common.variable_table import OPTIONS
 from psa_casadi.export.importer.fmu import CO_SIMULATION, MODEL_EXCHANGE, Fmu
 from psa_casadi.export.importer.imported import (
     Imported,
@@ -150,7 +151,7 @@ def _free(
 ) -> dict[str, tuple[float, float] | Parameter]:
     """Return the parameters to identify with their bounds: those of `free`, else the FMU's."""
     reals = {n for n in numbers if fmu.elements[n].real}
-    bounded = {n for n in reals if math.isfinite(math.hypot(*fmu.bounds[n]))}
+    bounded = {n for n in reals if math.isfinite(math.hypot(*fmu.bounds[n])) and n not in OPTIONS}
     if free is None:
         if not bounded:
             every = {n: e.start for n, e in fmu.elements.items() if n in reals}

@@ -167,10 +167,11 @@ def linearising_voltage(
 ) -> tuple[Expression, Expression]:  # fmt: skip
     """Return the next voltage u [V] at which k_L u + f_H(u) is the wanted force [N], and f_H there.
 
-    Eqs. (39) to (41). The paper subtracts the observed force of the moment; here it is that of the next instant, so
-    that no sample is lost. From `guess`, Newton's steps, which are enough for a jump across the
-    range: the slope only grows along the way from a turn. sgn(u') is that on the way to `guess`:
-    with delta < 0 a voltage that creeps on solves the equation of a place at rest, too.
+    Eqs. (39) to (41). The paper subtracts the observed force of the moment; here it is that of the
+    next instant, so that no sample is lost. From `guess`, Newton's steps, which are enough for a
+    jump across the range: the slope only grows along the way from a turn. sgn(u') is that on the
+    way to `guess`: with delta < 0 a voltage that creeps on solves the equation of a place at rest,
+    too.
     """
     u, held = guess, swept_over(c, last, guess)[2]
     for _ in range(_OUTER):
