@@ -321,15 +321,17 @@ class _Residual:
     def _with_drive(self, places: IndexArray) -> bool:
         """Whether places sit at steps, turns, values or rates of the input, as a misfit's do.
 
-        By how many samples are as near to so large a rate as all of them, by the binomial
-        distribution of how many are at turns, and by Pearson's chi-square test of how many lie in
-        each eighth of all values.
+        By the binomial distributions of how many are at the largest steps, each number's step being
+        the least, and at turns, and by Pearson's chi-square test of how many lie in each eighth of
+        all values.
         """
         if not self.inputs:
             return False
         values = self.inputs[0][self.index]
         largest = scipy.ndimage.maximum_filter1d(np.abs(np.diff(values, prepend=values[0])), 3)
-        at_steps = float(np.mean(largest >= np.min(largest[places]))) ** places.size
+        steps, counts = np.sort(largest[places])[::-1], np.arange(places.size)
+        shares = 1.0 - np.searchsorted(np.sort(largest), steps) / largest.size
+        at_steps = places.size * float(np.min(scipy.special.bdtrc(counts, places.size, shares)))
         if places.size <= _FEW:
             return at_steps < _NO_CHANCE
         turns = reversals(values, _TURN * float(np.ptp(values)))
