@@ -225,7 +225,8 @@ def guarded(command: Callable[P, None]) -> Callable[P, None]:
             lines = _error_lines(cause)
             for line in lines:
                 print_message(line)
-            _error_to_junit(command.__name__, options, lines, began)
+            if options.get("junit"):
+                _error_to_junit(command.__name__, options, lines, began)
             raise typer.Exit(2 if isinstance(cause, InputError) else 1) from error
 
     return run
@@ -297,13 +298,13 @@ def junit_text(command: str, subject: str, cases: Sequence[Case], seconds: float
 def _error_to_junit(
     command: str, options: Mapping[str, Any], lines: Sequence[str], began: float
 ) -> None:
-    """Write an error to the file of --junit, if one is named: no older result stays there.
+    """Write an error to the file of --junit: no older result stays there.
 
     A file that is there and no JUnit is left as it is: it may be named by mistake.
     """
-    junit = options.get("junit")
+    junit = options["junit"]
     with suppress(OSError, PsaError):
-        if junit and (not junit.exists() or b"<testsuites" in junit.read_bytes()[:200]):
+        if not junit.exists() or b"<testsuites" in junit.read_bytes()[:200]:
             subject = ", ".join(p.name for p in options.get("records") or [options["fmu"]])
             case = Case("run", "", "\n".join(lines))
             seconds = time.perf_counter() - began
