@@ -24,7 +24,7 @@ from psa_casadi.diagnosis.colour import residual_colour
 from psa_casadi.diagnosis.screening import independent, without
 from psa_casadi.diagnosis.task import shows_ringing
 from psa_casadi.identification.fitting.fit import Fit
-from psa_casadi.identification.mechanics import force_of, retuned, without_blur
+from psa_casadi.identification.mechanics import force_of, retuned, shortest_interval, without_blur
 from psa_casadi.identification.refitting import quick_from, refit
 from psa_casadi.identification.search import search
 from psa_casadi.identification.start.ordinary import ordinary_values
@@ -82,7 +82,7 @@ def ringing(fit: Fit) -> Ringing | None:
     The residual is whitened by an autoregression fitted to it, so that a tone has to follow the
     force to count: one that is there all the time counts as colour.
     """
-    interval, experiments = _interval(fit), fit.experiments
+    interval, experiments = shortest_interval(fit), fit.experiments
     forces = [
         None if e.held_out_whole else _force(fit, k, e, interval) for k, e in enumerate(experiments)
     ]
@@ -100,11 +100,6 @@ def ringing(fit: Fit) -> Ringing | None:
             if best is None or decrease > best.decrease:
                 best = Ringing(float(tone) / interval, decay / interval, 1.0 / interval, decrease)
     return best
-
-
-def _interval(fit: Fit) -> float:
-    """Return the shortest sampling interval of the fitted records [s]."""
-    return min(e.record.sample_time for e in fitted(fit.experiments))
 
 
 def _explained(columns: FloatArray, residual: FloatArray) -> float:
@@ -203,7 +198,7 @@ def from_resonances(base: Fit, progress: Progress) -> Fit | None:
     records = [e.record for e in fitted(base.experiments)]
     progress("resonances and lags")
     linear = linear_start(records, base.model.values)
-    if not resolved(base.model, linear, _interval(base)):
+    if not resolved(base.model, linear, shortest_interval(base)):
         return None
     ordinary = base.model.with_values(ordinary_values(base.model, records))
     best = base
@@ -246,7 +241,7 @@ def instead_of_mode(before: Fit, mode: Component, fit: Fit, progress: Progress) 
     progress("base fit, mode as resonance")
     values = fit.model.values
     tone, damping = values[mode.tone or ""], values["mode_damping"]
-    rate = 1.0 / _interval(fit)
+    rate = 1.0 / shortest_interval(fit)
     near = images(tone, rate, _NEAR_IMAGES)
     starts = [m for f in near for m in _masses(before.model.values, [f], damping * tone / f)]
     return _with_masses(before, starts, _as_good(fit, _AS_GOOD))
@@ -303,7 +298,7 @@ def _with_ringing(
     explains clearly more, down to the rms `least` [m]. A mass that is free already is tried
     elsewhere, too.
     """
-    rate = 1.0 / _interval(fit)
+    rate = 1.0 / shortest_interval(fit)
     if rate <= _SHOWS:
         return None
     tone = ringing(fit)

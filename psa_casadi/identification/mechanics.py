@@ -113,9 +113,14 @@ def with_fast(best: Fit, progress: Progress) -> Fit:
 
 def _is_beyond(fit: Fit, mass: str) -> bool:
     """Whether the resonance of a mass is too fast to show in the records."""
-    p, fastest = fit.model.values, min(e.record.sample_time for e in fitted(fit.experiments))
+    p = fit.model.values
     tone = np.sqrt(p[mass.replace("m", "k")] / p[mass]) / (2.0 * np.pi)
-    return bool(tone * fastest > _BEYOND)
+    return bool(tone * shortest_interval(fit) > _BEYOND)
+
+
+def shortest_interval(fit: Fit) -> float:
+    """Return the shortest sampling interval of the fitted records [s]."""
+    return min(e.record.sample_time for e in fitted(fit.experiments))
 
 
 def without_blur(best: Fit) -> Fit:
@@ -282,7 +287,7 @@ def _once(best: Fit) -> Fit | None:
 
 def _parts(best: Fit) -> Iterator[Excerpt]:
     """Yield the records with the fit's force, in metres of static displacement, for a voltage."""
-    fastest = min(e.record.sample_time for e in fitted(best.experiments))
+    fastest = shortest_interval(best)
     values, levels, total = best.model.values, residual_noise(best), 0
     for k, e in enumerate(best.experiments):
         record, y = e.record, e.record.measured
