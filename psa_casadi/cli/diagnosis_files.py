@@ -14,10 +14,16 @@ from psa_casadi.common.files import atomic_write
 from psa_casadi.design.experiment import experiment
 from psa_casadi.diagnosis import result
 from psa_casadi.diagnosis.search.state import one_of_each
+from psa_casadi.identification.start.doubts import doubtful_unit
 from psa_casadi.records import write_record
 from psa_casadi.report.words.design_words import sentences
 from psa_casadi.report.words.phrases import added, listing, number
-from psa_casadi.report.words.verdict_words import VERDICTS, of_range, verdict_sentence
+from psa_casadi.report.words.verdict_words import (
+    VERDICTS,
+    of_range,
+    since_reference,
+    verdict_sentence,
+)
 
 
 def alternatives(d: result.Diagnosis, output: Path | None) -> list[tuple[result.Alternative, Path]]:
@@ -135,13 +141,24 @@ def expected(
     return wanted, None if max_error is None else largest
 
 
+def _reservation(d: result.Diagnosis) -> str:
+    """Say why an adequate model passes no test: it is unconfirmed, has changed, or its unit is."""
+    if d.doubt:
+        return f"not confirmed: {d.doubt}."
+    if moved := since_reference(d)["moved"]:
+        return f"{moved} has changed since the reference."
+    stack = isinstance(d, result.StackDiagnosis)
+    unit = doubtful_unit([e.record for e in d.experiments]) if stack else ""
+    return f"a unit is in doubt. {unit}" if unit else ""
+
+
 def cases(d: result.Diagnosis, wanted: tuple[str, ...], max_error: float | None) -> list[Case]:
     """Return verdict and largest held-out error of the extended model as tests, failed or not."""
     wrong = f"The verdict is {d.verdict}; expected {listing(wanted, 'or')}."
-    unconfirmed = d.verdict == "adequate" and d.doubt
-    if unconfirmed:
-        wrong = f"The verdict is adequate, but not confirmed: {d.doubt}."
-    failed = bool(wanted) and (d.verdict not in wanted or bool(unconfirmed))
+    reserved = _reservation(d) if d.verdict == "adequate" else ""
+    if reserved:
+        wrong = f"The verdict is adequate, but {reserved}"
+    failed = bool(wanted) and (d.verdict not in wanted or bool(reserved))
     verdict = Case("verdict", f"{d.verdict}: {verdict_sentence(d)}", wrong if failed else "")
     large, shares = "", of_range(d, extended=True)
     worst = max(shares, key=lambda output: shares[output])

@@ -230,7 +230,7 @@ def modelica(
     model: Path | None = None,
     stack: StackName = None,
     part: PartName = None,
-    name: str = "PiezoStack",
+    name: str | None = None,
     include_sensor: bool = False,
     start: Start,
     published: Published,
@@ -240,16 +240,17 @@ def modelica(
 
     Options:
         output: Modelica file to write.
-        name: Name of the package.
+        name: Name of the package; by default PiezoStack, or that of your model.
 
     Example:
         psa export modelica --model extended.json -o PiezoStack.mo
     """
-    from psa_casadi.export.modelica.package import class_names
+    from psa_casadi.export.modelica.package import class_names, package_name
 
     inputs.outputs({"--output": output}, [model])
     chosen = _chosen(inputs, model, stack, part)
     chosen = inputs.ready(inputs.published(inputs.started(chosen, start), published))
+    name = name or package_name(chosen)
     psa.export_modelica(chosen, output, name=name, include_sensor=include_sensor)
     kept = _show_inside(chosen, include_sensor)
     show(f"classes: {', '.join(f'{name}.{c}' for c in class_names(kept))}")

@@ -29,6 +29,10 @@ T = TypeVar("T")
 #: What an option writes, and what the names of such files end with.
 PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
 
+#: Stiffness of free stacks [N/m], from a lever of 0.1 N/um to 100 x 100 mm2 of 1 cm with a margin
+#: of ten: what is outside is of another unit.
+_STIFFNESSES = (1e4, 1e11)
+
 
 @dataclass(kw_only=True)
 class Inputs:
@@ -250,11 +254,12 @@ class Inputs:
         return replace(model, publication=replace(model.publication, **statements))
 
     def stiffness(self, value: float | None) -> None:
-        """Demand a positive stiffness, if there is one."""
-        if value is not None and not 0.0 < value < float("inf"):
+        """Demand the stiffness of a free stack, if there is one."""
+        low, high = _STIFFNESSES
+        if value is not None and not low <= value <= high:
             self.add(
-                f"--stiffness is {value:g} N/m; give the positive stiffness of the free stack from"
-                " its data sheet, such as 5e7."
+                f"--stiffness is {value:g} N/m; give that of the free stack from its data sheet"
+                f" ({low:.0e} to {high:.0e} N/m), such as 5e7, which is 50 N/um."
             )
 
     def outputs(

@@ -34,7 +34,7 @@ def main(folder: Path) -> dict[str, str | float]:
     oscillator = model()
     psa.export_fmu(oscillator, folder / "van_der_pol.fmu")
     psa.export_fmu(oscillator, folder / "van_der_pol_3.fmu", fmi=3)
-    psa.export_modelica(oscillator, folder / "VanDerPol.mo", name="VanDerPol")
+    psa.export_modelica(oscillator, folder / "VanDerPol.mo")
     table: dict[str, str | float] = {}
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     axes = figure.subplots()

@@ -75,6 +75,7 @@ def test_importing_the_package_and_help_are_quick_and_load_no_casadi() -> None:
         (("diagnose", "{demo}", "-o", "{out}", "--json", "{out}"), "both"),
         (("identify", "{demo}", "--method", "paper", "--model", "{absent}"), "absent.csv"),
         (("identify", "{good}", "-o", "{good}"), "would overwrite an input"),
+        (("identify", "{demo}", "--stiffness", "50"), "5e7, which is 50 N/um"),
         (("design", "mechanism", "--stack", "demo", "--damping", "2", "-o", "{out}"), "2"),
         (("design", "mechanism", "--stack", "PTBS200", "--poles", "fast", "-o",
           "{folder}/no/m.json", "--max-stroke-loss", "much"), "3 problems with the input"),

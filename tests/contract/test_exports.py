@@ -228,6 +228,7 @@ def test_modelica_has_the_equations_for_another_compiler(tmp_path: Path) -> None
 def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> None:
     archive, picture = tmp_path / "stage.ssp", tmp_path / "wiring.svg"
     text = done("export", "ssp", "-o", archive, "--picture", picture).out
+    assert "give one of its FMUs ('amplifier.fmu', " in refused("check", archive)
     parts = [c.name for c in read_ssd(str(archive)).system.elements]
     assert parts == ["controller", "compensator", "amplifier", "stack", "flexure"]
     assert "reference" in text
@@ -249,6 +250,7 @@ def test_a_closed_loop_runs_as_ssp_as_it_does_as_one_model(tmp_path: Path) -> No
 
 def test_an_fmu_of_a_users_model_is_read_back_and_runs_equally(tmp_path: Path) -> None:
     path = psa.export_fmu(van_der_pol(), tmp_path / "v.fmu", fmi=3)
+    assert "has no input of the model" in refused("check", path, "--stack", STACK)
     read = psa.fmu_model(path, free={"mu": (0.1, 10.0)}, values={"mu": 2.3})
     time = np.linspace(0.0, 10.0, 501)
     nothing, start = np.empty((501, 0)), np.array([2.0, 0.0])

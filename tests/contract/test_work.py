@@ -41,7 +41,7 @@ def test_a_designed_experiment_keeps_its_limits_and_separates(tmp_path: Path) ->
 def test_a_designed_voltage_follows_its_path_on_the_independent_reference(tmp_path: Path) -> None:
     time = np.linspace(0.0, 0.04, 201)
     wanted = 4.0 - 4.0 * np.cos(2.0 * np.pi * time / 0.04)
-    path = write(tmp_path / "path.csv", {"time [s]": time, "displacement [um]": wanted})
+    path = write(tmp_path / "path.csv", {"Zeit [s]": time, "Sollwert [um]": wanted})
     done(
         "design", "input", "--stack", STACK, "--target", path, "--max-voltage", "100",
         "-o", tmp_path / "v.csv", "--no-check-fmu",

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 import psa_casadi as psa
-from psa_casadi.cli.diagnosis_files import write_patch
+from psa_casadi.cli.diagnosis_files import cases, write_patch
 from psa_casadi.common.units import FloatArray
 from psa_casadi.diagnosis.diagnose import filtered
 from psa_casadi.diagnosis.task import LIMITS
@@ -65,6 +65,7 @@ def test_another_unit_of_displacement_is_reported(factor: float, displacement: F
     result = _diagnosed(factor * displacement)
     assert result.verdict == "adequate"
     assert "its unit, or that of the voltage, is probably another" in result.notes[-1]
+    assert "its unit, or that of the voltage" in cases(result, ("adequate",), None)[0].failure
 
 
 def _modes() -> psa.Record:

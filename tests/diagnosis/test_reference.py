@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import psa_casadi as psa
+from psa_casadi.cli.diagnosis_files import cases
 from psa_casadi.common.notes import Note
 from psa_casadi.diagnosis.reference import Healthy
 from psa_casadi.identification.fitting.fit import fit
@@ -75,6 +76,7 @@ def test_a_gain_that_has_changed_is_reported_as_a_parameter() -> None:
     assert moved["alone"]
     assert moved["name"] == "k_P"
     assert moved["values"][1] > moved["values"][0]  # stiffer: less displacement
+    assert "k_P has changed" in cases(d, ("adequate",), None)[0].failure
     assert "since the reference" in " ".join(d.notes)
     assert "Of the base model k_P has changed" in verdict_sentence(d)
 

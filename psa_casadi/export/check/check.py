@@ -127,6 +127,7 @@ def check_fmu(
             ours = str(archive.description.generationTool).startswith("psa_casadi")
             holds_others = any(archive.directory.glob("resources/*/modelDescription.xml"))
             foreign = holds_others or (model is None and not ours)
+        _refuse_other(archive, model)
         if foreign:
             rows += [c.row() for c in described(archive)]
             task = Task(path, archive.directory, None, timeout, memory, foreign=True)
@@ -168,6 +169,15 @@ def _demand_zip(path: Path) -> None:
         raise InputError(f"{path}: cannot be read ({why_not_read(error)}); name an FMU.") from error
     if head != b"PK":
         raise InputError(f"{path}: cannot be read as an FMU, as it is no zip; export it again.")
+
+
+def _refuse_other(archive: Archive, model: Model | None) -> None:
+    """Refuse a model of which the FMU has no input."""
+    if model and model.input_names and archive.elements.keys().isdisjoint(model.input_names):
+        raise InputError(
+            f"{archive.path}: has no input of the model ({', '.join(model.input_names)}); give the"
+            " model that it was exported from, or none: an FMU of psa_casadi holds its model."
+        )
 
 
 def _described(

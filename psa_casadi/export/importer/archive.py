@@ -20,7 +20,7 @@ from typing import Any, Self
 
 import fmpy
 
-from psa_casadi.common.errors import InputError, Problems
+from psa_casadi.common.errors import InputError, Problems, quoted
 from psa_casadi.common.files import temporary_folder
 
 #: Most entries of an archive, and most bytes of all of them.
@@ -159,12 +159,16 @@ class Archive:
                 unpack(path, self.directory)
             self._read()
         except Exception as error:  # fmpy raises it for any damage
+            is_ssp = (self.directory / "SystemStructure.ssd").is_file()
+            parts = quoted(sorted(p.name for p in self.directory.rglob("*.fmu")))
             self._held.close()
             if isinstance(error, InputError):
                 raise
             reason = str(error).replace(f"{self.directory}{os.sep}", "")
-            problem = f"{path}: cannot be read as an FMU ({reason}); export it again."
-            raise InputError(problem) from error
+            problem = f"cannot be read as an FMU ({reason}); export it again."
+            if is_ssp:
+                problem = f"is an SSP; unpack it and give one of its FMUs ({parts or 'none'})."
+            raise InputError(f"{path}: {problem}") from error
 
     def _read(self) -> None:
         """Read the description; raises InputError if it is of no known kind."""

@@ -7,6 +7,7 @@ is none, since its bonding layers do not push back on the wafers. The class has 
 """
 
 import os
+import re
 from collections.abc import Iterable, Mapping
 from html import escape
 from pathlib import Path
@@ -46,14 +47,15 @@ def export_modelica(
     model: Model,
     path: str | os.PathLike[str],
     *,
-    name: str = "PiezoStack",
+    name: str | None = None,
     include_sensor: bool = False,
 ) -> Path:
     """Write a model as a Modelica package and return its path.
 
-    The package has `Signal` (inputs and outputs), `Acausal` (pins and flange, where the model has
-    the signals for them) and `Examples`. Sensor and environment stay out unless `include_sensor`.
-    The same model gives the same text. The file is written whole or not at all.
+    Without a `name` it has that of `package_name`. The package has `Signal` (inputs and outputs),
+    `Acausal` (pins and flange, where the model has the signals for them) and `Examples`. Sensor and
+    environment stay out unless `include_sensor`. The same model gives the same text. The file is
+    written whole or not at all.
 
     Raises InputError for an impossible name, values that are not finite, a text with a character
     that no document can carry, and an operation that Modelica does not have.
@@ -62,8 +64,16 @@ def export_modelica(
     return Path(path)
 
 
-def modelica_text(model: Model, *, name: str = "PiezoStack", include_sensor: bool = False) -> str:
+def package_name(model: Model) -> str:
+    """Return PiezoStack for a stack, else the model's name as Modelica writes it: VanDerPol."""
+    if drawing_of(model) == "stack":
+        return "PiezoStack"
+    return "".join(word[:1].upper() + word[1:] for word in re.split(r"[\W_]+", model.name))
+
+
+def modelica_text(model: Model, *, name: str | None = None, include_sensor: bool = False) -> str:
     """Return the text that `export_modelica` writes; raises what it raises."""
+    name = package_name(model) if name is None else name
     check_identifier(name, "a Modelica package")
     refuse_foreign(model.structure, "Modelica")
     exported = model if include_sensor else model.plant()

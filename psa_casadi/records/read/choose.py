@@ -198,6 +198,8 @@ class Choice(Chosen):
             self._count()
             return
         self._take_canonical_names()
+        if "voltage" not in self.required:  # of a path to follow
+            self.left = [replace(c, words=c.words - _COMMANDED) for c in self.left]
         unclear = self._take_other_names()
         self._ask(unclear, self._complain())
         self.sources = {**self.wanted, **self.sources} if self.sources else {}
