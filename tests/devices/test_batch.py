@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import signal
 import subprocess
 import threading
@@ -11,15 +12,15 @@ from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from datetime import date
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import IO, Any
 
 import numpy as np
 import pytest
 
 import psa_casadi as psa
-from psa_casadi.common import children
+from psa_casadi.common import children, processes
 from psa_casadi.common.interruption import raise_if_stopped
-from psa_casadi.common.processes import Processes
 from psa_casadi.common.strict_json import json_text
 from psa_casadi.devices import executors
 from psa_casadi.devices.executors import outcomes
@@ -296,19 +297,23 @@ def test_dask_that_is_missing_is_an_error(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @slow
-def test_a_process_that_dies_takes_one_device_with_it(records: Path) -> None:
+def test_a_process_that_dies_takes_one_device_with_it(
+    records: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def sent(call: tuple[Any, DeviceTask], stream: IO[bytes]) -> None:
+        if call[1].job.device == "d1":  # its process dies while it gets the task
+            (child,) = children._CHILDREN
+            os.kill(child.pid, signal.SIGKILL)
+        pickle.dump(call, stream)
+
     job = next(j for j in jobs_given(records) if j.device == "first")
     items = [DeviceTask(psa.Job(f"d{k}", job.files), psa.Options(), "run") for k in range(3)]
-    processes = Processes(1)
+    monkeypatch.setattr(processes, "pickle", SimpleNamespace(**{**vars(pickle), "dump": sent}))
+    executor = processes.Processes(1)
     try:
-        table = {}
-        for task, outcome in outcomes(items, processes, 1):
-            table[task.job.device] = outcome
-            if task.job.device == "d0":  # the next starts with a process that is dying
-                (child,) = children._CHILDREN
-                os.kill(child.pid, signal.SIGKILL)
+        table = {t.job.device: outcome for t, outcome in outcomes(items, executor, 1)}
     finally:
-        processes.end()
+        executor.end()
     assert [table[f"d{k}"].status for k in range(3)] == ["done", "failed", "done"]
     assert "ended (signal 9)" in table["d1"].problems[0]
 

@@ -6,11 +6,11 @@
 #include <unistd.h>
 #define API __attribute__((visibility("default")))
 
-static void note(void)
+static void note(pid_t pid)
 {
     const char *place = getenv("PSA_TEST_PLACE");
     FILE *file = place ? fopen(place, "a") : NULL;
-    if (file) { fprintf(file, "%d\n", (int)getpid()); fclose(file); }
+    if (file) { fprintf(file, "%d\n", (int)pid); fclose(file); }
 }
 
 static void do_deed(const char *deed)
@@ -21,11 +21,12 @@ static void do_deed(const char *deed)
     if (!strcmp(deed, "_exit")) _exit(0);
     if (!strcmp(deed, "abort")) abort();
     if (!strcmp(deed, "fault")) raise(SIGSEGV);
-    if (!strcmp(deed, "hang")) { note(); for (;;) pause(); }
+    if (!strcmp(deed, "hang")) { note(getpid()); for (;;) pause(); }
     if (!strcmp(deed, "child")) {
-        if (fork()) _exit(0);
-        note();
-        for (;;) pause();
+        pid_t pid = fork();
+        if (!pid) for (;;) pause();
+        note(pid);
+        _exit(0);
     }
     if (!strcmp(deed, "memory"))
         for (;;) {
