@@ -51,7 +51,8 @@ def linearize(
     from psa_casadi.report.plots.figures import bode_figure, write_figure
     from psa_casadi.report.words.catalogue import say
 
-    inputs.outputs({"--output": output, "--figure": figure, "--observer": observer}, [model, fmu])
+    files = {"--output": output, "--figure": figure, "--observer": observer}
+    inputs.outputs(files, [model, fmu], ("matrices", ".mat", ".json"))
     chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
     if chosen is None:
         chosen = inputs.model_or_stack(model, stack, any_model=True)
