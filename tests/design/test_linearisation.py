@@ -303,7 +303,7 @@ def test_modelica_block_gives_what_the_stream_gives() -> None:
     wave = "60*(1 - cos(62.83185307179586*({})))"
     harness = f"""
     model Driven
-      PiezoStack.Signal rls;
+      OnlineIdentification.Signal rls;
     equation
       rls.voltage = {wave.format("time")};
       rls.position = 1.4e-7*{wave.format("time - 1e-3")};

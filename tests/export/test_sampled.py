@@ -20,7 +20,7 @@ from psa_casadi.export.importer.fmu import (
     FmuError,
 )
 from psa_casadi.export.importer.masters import Signals, co_simulate, integrate
-from psa_casadi.export.modelica.package import modelica_text
+from psa_casadi.export.modelica.package import modelica_text, package_name
 from tests.export.fmu_models import exported, model_named
 from tests.export.modelica_runs import load
 from tests.model.sampled_models import (
@@ -271,7 +271,7 @@ COUNT = 121
 
 def simulated(model: psa.Model, inputs: str, names: tuple[str, ...]) -> Mapping[str, FloatArray]:
     """Return variables of `Signal` on the grid of quarters of a period, at instants after them."""
-    harness = f"model Harness PiezoStack.Signal it({inputs}); end Harness;"
+    harness = f"model Harness {package_name(model)}.Signal it({inputs}); end Harness;"
     config = rumoca.SimConfig(solver="bdf", rtol=1e-11, atol=1e-16, dt=PERIOD / 4)
     span = PERIOD * (COUNT - 1) / 4
     result = load(modelica_text(model) + harness, "Harness").simulate(t=(0.0, span), config=config)
