@@ -51,7 +51,8 @@ def linearize(
     from psa_casadi.report.plots.figures import bode_figure, write_figure
     from psa_casadi.report.words.catalogue import say
 
-    files = {"--output": output, "--figure": figure, "--observer": observer}
+    is_fmu = observer is not None and observer.suffix.lower() == ".fmu"
+    files = {"--output": output, "--figure": figure, "--observer": observer if is_fmu else None}
     inputs.outputs(files, [model, fmu], ("matrices", ".mat", ".json"))
     chosen = own_model(inputs, model, Fitting(fmu=fmu), fitted=False)
     if chosen is None:
@@ -75,7 +76,7 @@ def linearize(
             output_noise={n: v for n, v in sizes.items() if n not in result.input_names},
             step=inputs.ready(seconds),
         )
-        if observer.suffix.lower() == ".fmu":
+        if is_fmu:
             psa.export_fmu(made, observer)
         else:
             psa.export_c(made, observer, step=inputs.ready(seconds))

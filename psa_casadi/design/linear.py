@@ -34,8 +34,9 @@ V = TypeVar("V", State, Input, Output)
 class Linear(Celled):
     """A model linearised at an operating point; matrices in SI units, in the order of the names.
 
-    `held` are states that rest at any value (hysteresis): they are constants here. `rates` (nx,)
-    are x' at the point, 0 at rest.
+    `held` are states that rest at any value (hysteresis): they are constants here, so that the gain
+    is that of the elastic part; `simulate` has that of small loops. `rates` (nx,) are x' at the
+    point, 0 at rest.
     """
 
     a: FloatArray
@@ -78,7 +79,7 @@ class Linear(Celled):
         at = ", ".join(f"{n} = {v:.6g}" for n, v in zip(self.input_names, self.u, strict=True))
         lines = [f"'{self.name}' about {at or 'its start'}: {len(self.x)} states"]
         if self.held:
-            lines.append(f"  constant here, rests at any value: {', '.join(self.held)}")
+            lines.append(f"  constant here, though small loops move it: {', '.join(self.held)}")
         for p in self.poles:
             size, real = abs(p), p.real
             if p.imag > 0.0:
@@ -220,7 +221,8 @@ def margins(
     Needs the extra `control`.
     """
     control = _control()
-    plant = of.to_control()[_one(of.output_names, output), _one(of.input_names, input)]
+    row = _one(of.output_names, output, "`output`, --to")
+    plant = of.to_control()[row, _one(of.input_names, input, "`input`, --from")]
     try:
         loop = plant * control.tf(*map(list, controller))
     except ValueError as error:
@@ -326,11 +328,11 @@ def _sized(variable: V, model: Model) -> V:
     return replace(variable, nominal=nominal_value(variable.nominal, model.values))
 
 
-def _one(names: Sequence[str], name: str | None) -> int:
+def _one(names: Sequence[str], name: str | None, what: str = "") -> int:
     if name is None and len(names) == 1:
         return 0
     if name not in names:
-        which = f"'{name}' is none of" if name else "Name the input and the output; there are"
+        which = f"'{name}' is none of" if name else f"Name one ({what}) of"
         raise InputError(f"{which} {quoted(names)}.")
     return names.index(name)
 

@@ -29,9 +29,14 @@ def given_to(model: Model, records: Any, hold: Hold | None, first: int = 1) -> l
 
 
 def undecided(records: Any, hold: Hold | None) -> bool:
-    """Whether it is open what inputs do between samples: no `hold`, and no `Signals`."""
+    """Whether it is open what inputs do between samples.
+
+    No `hold` and no `Signals` state it. Those that were read from a file do where they are no
+    longer linear, as every one is at first.
+    """
     inputs = records if isinstance(records, list | tuple) else [records]
-    return hold is None and not any(isinstance(r, Signals) for r in inputs)
+    stated = (r for r in inputs if isinstance(r, Signals))
+    return hold is None and not any(not r.source or r.hold != "linear" for r in stated)
 
 
 def experiments_of(

@@ -385,6 +385,18 @@ def test_an_input_that_is_held_is_read_so_and_a_staircase_read_as_lines_is_repor
     assert again.model.values == psa.identify(oven(), held, known_start=True).model.values
 
 
+def test_a_file_leaves_open_what_its_inputs_do_between_samples(tmp_path: Path) -> None:
+    path, held = tmp_path / "oven.csv", plants.oven(40)
+    units = {"heater": "W", "wall": "K", "air": "K"}
+    columns = {f"{n} [{units[n]}]": v for n, v in held.columns.items()}
+    psa.write_record(path, {"time [s]": held.time, **columns})
+    read = psa.read_signals(path, inputs=oven().input_names, outputs=oven().output_names)
+    result = psa.identify(oven(), read, known_start=True)
+    assert {e.record.hold for e in result.experiments} == {"zero"}
+    stated = psa.identify(oven(), read, known_start=True, hold="linear")
+    assert {e.record.hold for e in stated.experiments} == {"linear"}
+
+
 @pytest.mark.slow
 def test_a_record_without_noise_hides_nothing_and_shows_what_is_hidden() -> None:
     """A simulation errs by its tolerance, which is no cause; what is rounded is no cause either."""

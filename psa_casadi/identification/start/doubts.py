@@ -278,8 +278,8 @@ _OFFSET = 100.0
 _FALLING = -0.5
 _POWERS = (0, -3, 3, -6, 6, -9, 9)
 #: The unit that a column is probably in and the one it is taken for, by the power of ten between.
-_LENGTHS = {-3: "um, not mm", -6: "um, not m", -9: "nm, not m",
-            3: "um, not nm", 6: "um, not pm", 9: "mm, not pm"}  # fmt: skip
+_LENGTHS = {-3: "um, not mm, or in nm, not um", -6: "um, not m", -9: "nm, not m",
+            3: "um, not nm, or in mm, not um", 6: "um, not pm", 9: "mm, not pm"}  # fmt: skip
 _VOLTAGES = {-3: "mV, not V", -6: "uV, not V", -9: "uV, not kV",
              3: "kV, not V", 6: "kV, not mV", 9: "kV, not uV"}  # fmt: skip
 
@@ -426,8 +426,8 @@ def _suggestion(stroke: float, span: float) -> str:
     ]
     power = min(fits, key=lambda p: abs(p[0]) + abs(p[1]), default=(0, 0))
     changes = [
-        f"the {name} is in {units[p]} (or in units as far apart): correct the header, or give"
-        f" --columns {name}=NAME:{units[p].split(',')[0]}"
+        f"the {name} is in {units[p]} (or in units as far apart): correct the header, or give the"
+        f" right one, as --columns {name}=NAME:{units[p].split(',')[0]}"
         for name, p, units in (
             ("displacement", power[0], _LENGTHS), ("voltage", power[1], _VOLTAGES),
         )

@@ -253,8 +253,13 @@ def interval_text(low: float, high: float) -> str:
     """Return an interval; one over more than four decades counts as not determined."""
     if not (math.isfinite(low) and math.isfinite(high)) or (low > 0 and high > 1e4 * low):
         return "not determined"
-    digits = next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)
+    digits = interval_digits(low, high)
     return f"{number(low, digits)} to {number(high, digits)}"
+
+
+def interval_digits(low: float, high: float) -> int:
+    """Return with how many significant digits the ends of an interval differ, three at least."""
+    return next((d for d in (3, 4, 5) if number(low, d) != number(high, d)), 6)
 
 
 def added(d: Diagnosis) -> bool:

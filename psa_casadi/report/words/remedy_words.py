@@ -20,6 +20,7 @@ from psa_casadi.report.words.phrases import (
     added,
     handy_scale,
     in_display_unit,
+    interval_digits,
     interval_text,
     listing,
     lowered,
@@ -76,7 +77,7 @@ def _amount(size: Size, length: Scale) -> str:
     if size.interval is None:
         return scale.text(value)
     ends = sorted(scale.factor * abs(v) for v in size.interval)
-    return f"{scale.text(value)} ({interval_text(*ends)})"
+    return f"{scale.text(value, interval_digits(*ends))} ({interval_text(*ends)})"
 
 
 #: The files of a base and an extended model where none was named, as the documentation calls them.

@@ -163,7 +163,8 @@ def cause_size(d: Diagnosis, cause: Cause) -> str:
         if name in weights:
             continue
         unit, (value, *ends) = phrases.in_display_unit(d.model, name, e.value, *e.interval)
-        estimate = phrases.with_unit(phrases.number(value), unit)
+        digits = phrases.interval_digits(*ends)
+        estimate = phrases.with_unit(phrases.number(value, digits), unit)
         texts.append(f"{name} = {estimate} ({phrases.interval_text(*ends)})")
     if weights:
         texts.append(f"{len(weights)} weights, which shape its loop together")
