@@ -24,7 +24,7 @@ def simulate(
     stack: StackName = None,
     value: list[str] | None = None,
     start: list[str] | None = None,
-    hold: Literal["linear", "zero"] = "linear",
+    hold: Literal["linear", "zero"] | None = None,
     figure: Path | None = None,
     reading: Reading,
     begin: Start,
@@ -44,7 +44,8 @@ def simulate(
         fmu: FMU of any tool, in the place of --model.
         value: Parameter in place of the model's, NAME=VALUE in SI units; repeat for several.
         start: Start of a state, NAME=VALUE in SI units; repeat for several.
-        hold: What the inputs do between samples.
+        hold: What the inputs do between samples; by default what they did in the records that the
+            model was identified from.
         figure: Picture of all inputs and outputs to write, PNG, SVG or PDF as its name
             ends.
         start_voltage: Voltage [V] that holds the stack when it starts, as in `psa export fmu`; by
@@ -66,6 +67,7 @@ def simulate(
     if chosen is not None:
         chosen = inputs.attempt(partial(_changed, chosen, values, starts))
     chosen, record = inputs.ready(chosen), inputs.ready(record)
+    hold = hold or chosen.provenance.hold
     with working("simulating"):
         applied = {n: c for n in chosen.input_names if (c := record.column(n)) is not None}
         if isinstance(record, psa.Record):

@@ -187,6 +187,7 @@ def with_origin(
         package_version=__version__,
         free=tuple(free),
         intervals=intervals,
+        hold=records[0].hold,
         **more,
     )
     return replace(model, provenance=provenance, evidence=None)

@@ -89,6 +89,7 @@ class ModelFile:
     publication: Publication = field(default_factory=Publication)
     starts: Mapping[str, float] = field(default_factory=dict)
     interrupted: bool = False
+    hold: Literal["linear", "zero"] = "linear"
     force_scale: str = "assumed"
     notes: tuple[str, ...] = ()
     identified_from: tuple[IdentifiedFrom, ...] = ()
@@ -129,6 +130,7 @@ def dumps(model: Model) -> str:
         **({"own": plain(written)} if written else {}),
         **({"starts": starts} if starts else {}),
         **({"interrupted": True} if origin.interrupted else {}),
+        **({"hold": "zero"} if origin.hold == "zero" else {}),
         "force_scale": origin.force_scale,
         "notes": list(origin.notes),
         "identified_from": [{"record": n, "sha256": h} for n, h in origin.identified_from],
@@ -222,6 +224,7 @@ def model_of(
         force_scale=file.force_scale,
         notes=file.notes,
         interrupted=file.interrupted,
+        hold=file.hold,
     )
     return model.with_values(
         {}, provenance=provenance, publication=file.publication, evidence=file.evidence

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 Values = Mapping[str, float]
 Nominal = float | Callable[[Values], float]
@@ -112,7 +112,8 @@ class Interval(NamedTuple):
 class Provenance:
     """Where a model's values come from: records, package version, what was free, how sure.
 
-    `interrupted`: they are those of a search that did not come to its end.
+    `interrupted`: they are those of a search that did not come to its end. `hold` is what inputs do
+    between the samples of the records.
     """
 
     identified_from: tuple[tuple[str, str], ...] = ()
@@ -122,6 +123,7 @@ class Provenance:
     force_scale: str = "assumed"
     notes: tuple[str, ...] = ()
     interrupted: bool = False
+    hold: Literal["linear", "zero"] = "linear"
 
 
 @dataclass(frozen=True)

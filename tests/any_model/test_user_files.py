@@ -393,6 +393,8 @@ def test_a_file_leaves_open_what_its_inputs_do_between_samples(tmp_path: Path) -
     read = psa.read_signals(path, inputs=oven().input_names, outputs=oven().output_names)
     result = psa.identify(oven(), read, known_start=True)
     assert {e.record.hold for e in result.experiments} == {"zero"}
+    psa.save_model(result.model, tmp_path / "m.json")
+    assert psa.load_model(tmp_path / "m.json").provenance.hold == "zero"
     stated = psa.identify(oven(), read, known_start=True, hold="linear")
     assert {e.record.hold for e in stated.experiments} == {"linear"}
 

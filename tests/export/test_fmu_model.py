@@ -86,6 +86,20 @@ def test_the_variables_are_those_of_the_description() -> None:
     assert float(rate[1]) == pytest.approx(_rate(*AT, 0.0, 0.8, 0.05, 1.62), rel=1e-14)
 
 
+def test_units_that_are_no_si_units_are_kept(tmp_path: Path) -> None:
+    x, room, k = (ca.SX.sym(n) for n in ("x", "room", "k"))
+    plate = psa.ode_model(
+        {"x": x, "u": room, "p": k, "ode": k * (room - x), "y": x},
+        name="plate",
+        inputs=[psa.Input("room", "degC", "room")],
+        outputs=[psa.Output("plate", "degC", "plate")],
+        parameters=[psa.Parameter("k", 0.5, "1/min", (0.05, 5.0), "rate")],
+    )
+    model = psa.fmu_model(psa.export_fmu(plate, tmp_path / "plate.fmu"))
+    assert (model.structure.inputs[0].unit, model.structure.outputs[0].unit) == ("degC", "degC")
+    assert model.parameter("k").unit == "1/min"
+
+
 def test_changed_parameters_are_identified() -> None:
     result = psa.identify(psa.fmu_model(pendulum(), free=FREE), _record(), starts=2)
     for name, value in TRUE.items():

@@ -222,14 +222,14 @@ def _name(name: str, taken: Iterable[str] = (), suffix: str = "_of_fmu") -> str:
 
 
 def _unit_and_words(variable: Any, name: str) -> tuple[str, str]:
-    """Return unit and description; "1" where this package does not know it or it is no SI unit."""
+    """Return unit and description; "1" where this package does not know the unit."""
     symbol = variable.unit or getattr(variable.declaredType, "unit", None) or "1"
     words = str(variable.description or name)
     try:
-        unit = parse_unit(symbol)
+        parse_unit(symbol)
     except InputError:
         return "1", words
-    return symbol if unit.ratio == 1 and not unit.offset else "1", words
+    return symbol, words
 
 
 #: Points at which it is looked whether a rate is another state, and nothing else.
