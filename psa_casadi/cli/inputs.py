@@ -438,6 +438,8 @@ def from_python(path: Path) -> "psa.Model | None":
         raise InputError(
             f"--model: {file} cannot make a model ({type(error).__name__}: {error}); correct it."
         ) from error
+    if callable(made) and not isinstance(model, psa.Model):
+        raise InputError(f"--model: {name} of {file} returns no psa.Model; let it return one.")
     if not isinstance(model, psa.Model):
         functions = [n for n, v in held.items() if getattr(v, "__module__", "") == file.stem]
         near = [*difflib.get_close_matches(name, functions, 1), *functions[::-1], "make"][0]

@@ -248,13 +248,15 @@ def instead_of_mode(before: Fit, mode: Component, fit: Fit, progress: Progress) 
 
 
 @stage("base fit again")
-def instead_of(base: Fit, fit: Fit, progress: Progress) -> Fit | None:
+def instead_of(base: Fit, fit: Fit, progress: Progress, other: Fit | None = None) -> Fit | None:
     """Fit the base with its resonances in the place of the effect in `fit`.
 
     None where no masses explain the data about as well as the effect. A resonance above the band
     delays what is within it, as a lag would; two within it that a fit has mistaken for others leave
-    what looks like a further mode.
+    what looks like a further mode. The `other` base has resonances that the records show.
     """
+    if other is not None and _short(other, fit) < _LIKE:
+        return other
     rung = _with_ringing(base, progress, least=_as_good(fit, _LIKE))
     if rung is not None and _short(rung, fit) < _LIKE:
         return _tuned(rung, progress)

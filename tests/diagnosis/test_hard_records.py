@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lsim
 
 import psa_casadi as psa
 from psa_casadi.common.units import FloatArray
@@ -131,6 +132,47 @@ def test_an_undetected_resonance_is_no_cause(tmp_path: Path) -> None:
     make_record(None, 118254, tmp_path / "a.csv", noise="ar")
     effects = [EFFECTS[n] for n in ("structural_mode", "sensor_delay", "sensor_lag", "drive_lag")]
     assert diagnose([read_record(tmp_path / "a.csv")], effects=effects).verdict == "adequate"
+
+
+#: Instants per sample of the stage, and the largest change of voltage in a step of its loop [V].
+_FINE, _SMALL = 16, 0.25
+
+
+def _stage(frequency: float, damping: float, seed: int) -> psa.Record:
+    """A loaded stage at 1 kHz: a Bouc-Wen loop, an amplifier of 0.8 ms and a resonance."""
+    rng, t = np.random.default_rng(seed), np.arange(500) / 1e3
+    loops = ((2, 60.0), (4, 40.0), (10, 30.0), (20, 20.0))
+    sines = [a * (1.0 - np.cos(2 * np.pi * f * t)) for f, a in loops]
+    steps = np.repeat(rng.choice([0.0, 20.0, 40.0, 80.0, 100.0], 8), 250)
+    voltage = np.concatenate([*sines, steps])
+    u = np.interp(np.arange(_FINE * voltage.size) / _FINE, np.arange(voltage.size), voltage)
+    h, force = 0.0, [0.0]
+    for change in np.diff(u).tolist():
+        count = int(abs(change) / _SMALL) + 1
+        e = change / count
+        for _ in range(count):  # the midpoint rule for h' = a u' - beta |u'| h - gamma u' |h|
+            q = h + 0.5 * (0.25 * e - 0.012 * abs(e) * h - 0.008 * e * abs(h))
+            h += 0.25 * e - 0.012 * abs(e) * q - 0.008 * e * abs(q)
+        force.append(h)
+    y, w = 0.2e-6 * (u - force), 2 * np.pi * frequency
+    for top, bottom in (([1.0], [8e-4, 1.0]), ([w * w], [1.0, 2 * damping * w, w * w])):
+        _, y, _ = lsim((top, bottom), y, 1e-3 / _FINE * np.arange(y.size))
+    y = y[::_FINE] + 5e-4 * np.ptp(y) * rng.standard_normal(voltage.size)
+    return psa.Record(
+        name="stage", time=np.arange(voltage.size) / 1e3, voltage=voltage, displacement=y
+    )
+
+
+@pytest.mark.parametrize(
+    ("frequency", "damping"),
+    slow_but([(320.0, 0.2)], [(140.0, 0.3), (180.0, 0.06), (250.0, 0.7), (320.0, 0.2)]),
+)
+def test_a_stage_that_rings_within_the_band_of_a_slow_record_is_clean(
+    frequency: float, damping: float
+) -> None:
+    d = psa.diagnose(_stage(frequency, damping, 1))
+    assert d.verdict == "adequate"
+    assert d.base_errors.holdout_rms_m < 1.05 * d.noise_floor_rms_m
 
 
 def test_quick_fits_integrate_below_the_noise(tmp_path: Path) -> None:

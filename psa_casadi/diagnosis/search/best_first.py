@@ -65,6 +65,7 @@ class _Search:
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
         self.sets_of: Hypothesis | None = None
+        self.seen: Hypothesis | None = None
         self.shaken: dict[Names, Fit] = {}
         self.tried: set[tuple[Fit, str]] = set()
 
@@ -317,7 +318,8 @@ class _Search:
         if base_fit.rings(last):
             fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.progress)
         if fit is None and not before.causes and not self.is_new(before):
-            fit = base_fit.instead_of(before.fit, h.fit, task.progress)
+            other = self.seen.fit if self.seen else None
+            fit = base_fit.instead_of(before.fit, h.fit, task.progress, other)
         self.known.note(hypothesis(before.causes, fit, final=True))
 
     def resonances(self, h: Hypothesis, view: View) -> bool:
@@ -330,7 +332,7 @@ class _Search:
         task = self.task
         if not view.test.alarm or not self.does("resonances"):
             return False
-        if task.is_fast(h.fit) and not h.causes and self.seen_in_records():
+        if not h.causes and self.seen_in_records(sure=not task.is_fast(h.fit)):
             return True
         if not self.once("ringing", h.names):
             return False
@@ -345,13 +347,19 @@ class _Search:
             self.known.note(other)
         return self.known.hypotheses.get(h.names) is not h
 
-    def seen_in_records(self) -> bool:
-        """Fit the base from resonances and lags that the records show; whether it is better."""
+    def seen_in_records(self, *, sure: bool = False) -> bool:
+        """Fit the base from resonances and lags that the records show; whether it is better.
+
+        If `sure`, it counts only where it leaves nothing: slow records rarely show a resonance, and
+        what looks like one may be of a cause. Without, what was fitted before counts.
+        """
         root, task = self.known.root, self.task
-        if not self.once("resonances", NONE) or not self.does("resonances"):
-            return False
-        fitted = base_fit.from_resonances(root.fit, task.progress)
-        self.known.note(hypothesis((), fitted, final=True))
+        if self.once("resonances", NONE) and self.does("resonances"):
+            fitted = base_fit.from_resonances(root.fit, task.progress)
+            self.seen = hypothesis((), fitted, final=True)
+        if self.seen and not (sure and examine(self.seen, task, self.known.trials).leaves):
+            self.known.note(self.seen)
+            self.seen = None
         return self.known.root is not root
 
     def report(self, h: Hypothesis, what: str) -> None:
