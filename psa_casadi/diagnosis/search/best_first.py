@@ -65,7 +65,7 @@ class _Search:
         self.expanded: dict[Names, Hypothesis] = {}
         self.done: set[tuple[str, Names]] = set()
         self.sets_of: Hypothesis | None = None
-        self.seen: Hypothesis | None = None
+        self.resonant: Hypothesis | None = None
         self.shaken: dict[Names, Fit] = {}
         self.tried: set[tuple[Fit, str]] = set()
 
@@ -318,7 +318,7 @@ class _Search:
         if base_fit.rings(last):
             fit = base_fit.instead_of_mode(before.fit, last, h.fit, task.progress)
         if fit is None and not before.causes and not self.is_new(before):
-            other = self.seen.fit if self.seen else None
+            other = self.resonant.fit if self.resonant else None
             fit = base_fit.instead_of(before.fit, h.fit, task.progress, other)
         self.known.note(hypothesis(before.causes, fit, final=True))
 
@@ -356,10 +356,10 @@ class _Search:
         root, task = self.known.root, self.task
         if self.once("resonances", NONE) and self.does("resonances"):
             fitted = base_fit.from_resonances(root.fit, task.progress)
-            self.seen = hypothesis((), fitted, final=True)
-        if self.seen and not (sure and examine(self.seen, task, self.known.trials).leaves):
-            self.known.note(self.seen)
-            self.seen = None
+            self.resonant = hypothesis((), fitted, final=True)
+        if self.resonant and not (sure and examine(self.resonant, task, self.known.trials).leaves):
+            self.known.note(self.resonant)
+            self.resonant = None
         return self.known.root is not root
 
     def report(self, h: Hypothesis, what: str) -> None:
