@@ -299,8 +299,8 @@ def runs(pid: int) -> bool:
 
 
 def ended(pid: int) -> bool:
-    """Whether a process ends within half a minute, as a busy machine may take."""
-    for _ in range(3000):
+    """Whether a process ends within two seconds."""
+    for _ in range(200):
         if not runs(pid):
             return True
         time.sleep(0.01)

@@ -289,6 +289,8 @@ def ssp(
 
     files = {"--output": output, "--picture": picture}
     inputs.outputs(files, [model], ("an SSP archive", ".ssp"))
+    if picture is not None and picture.suffix.lower() not in (".svg", ".png"):
+        inputs.add(f"{picture}: a picture of the wiring is .svg or .png; name it so.")
     wanted = [p.strip() for p in platforms.split(",") if p.strip()]
     inputs.attempt(lambda: chosen_platforms(wanted))
     any_model = own_model(inputs, model, Fitting())

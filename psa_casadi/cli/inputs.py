@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 #: What an option writes, and what the names of such files end with.
 PAGE, _PICTURE = ("a page", ".html", ".htm"), ("a picture", ".png", ".svg", ".pdf")
-_ENDINGS = {"--report": PAGE, "--figure": _PICTURE, "--picture": _PICTURE[:3]}
 
 #: Stiffness of free stacks [N/m], from a lever of 0.1 N/um to 100 x 100 mm2 of 1 cm with a margin
 #: of ten: what is outside is of another unit.
@@ -274,7 +273,7 @@ class Inputs:
         Where the name of a page or a picture has an ending, it is one of theirs; so is that of the
         `output`: what it is, and its endings.
         """
-        endings = {**_ENDINGS, "--output": output}
+        endings = {"--report": PAGE, "--figure": _PICTURE, "--output": output}
         sources = {p.resolve() for p in inputs if p is not None}
         taken: dict[Path, str] = {}
         for option, path in named.items():
